@@ -1,7 +1,6 @@
 """The renderer as its user meets it: outputs, backgrounds, layers, modes, options."""
 
 import dataclasses
-import math
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -143,15 +142,12 @@ def test_dropped_gaussians_are_seen_but_not_drawn(exactly):
     assert largest(out.image, GaussianRenderer()(Gaussians(*kept), camera).image) <= bound
 
 
-def test_rgb_is_taken_as_it_is_and_harmonics_are_shifted_by_a_half():
-    gaussians, camera = random_gaussians(30, 0, sh_degree=None), random_camera(24, 32, 0)
-    constant = (gaussians.colors - 0.5)[:, None] * (2 * math.sqrt(math.pi))
-    for size in (1, 4, 9, 16):
-        colors = torch.cat([constant, constant.new_zeros(30, size - 1, 3)], 1)
-        other = dataclasses.replace(gaussians, colors=colors)
-        assert largest(GaussianRenderer()(gaussians, camera).image, GaussianRenderer()(other, camera).image) <= 1e-14
+def test_neither_colors_nor_the_image_are_clamped():
+    gaussians = random_gaussians(30, 0, sh_degree=None)
     bright = dataclasses.replace(gaussians, colors=gaussians.colors * 100 - 50)
-    assert GaussianRenderer()(bright, camera).image.min() < -1  # neither colours nor the image are clamped
+    image = GaussianRenderer()(bright, random_camera(24, 32, 0)).image
+    assert image.min() < -1
+    assert image.max() > 2
 
 
 # -- modes and options --------------------------------------------------------------------------------------------

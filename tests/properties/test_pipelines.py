@@ -1,6 +1,5 @@
 """The layer and the loss in pipelines that are not ours: checkpointing, compilers, a plain splatting loop."""
 
-import copy
 import math
 
 import pytest
@@ -146,12 +145,6 @@ def test_a_model_in_inference_mode_renders_and_the_training_goes_on():
     loss = photometric_loss(renderer.train()(model(), camera).image, expected.clone())
     loss.backward()
     assert torch.equal(renderer.eval()(model(), camera).image, expected)
-
-
-def test_a_whole_network_survives_deepcopy_and_shared_memory():
-    network = Blobs(at(0.5, p=0.2, seed=3))
-    twin = copy.deepcopy(network).share_memory()
-    assert torch.equal(twin(), network())
 
 
 def rendered_fit(backend, seed):
