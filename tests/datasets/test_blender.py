@@ -32,14 +32,6 @@ def write(root: Path, train: int = 6, test: int = 3) -> None:
             cv2.imwrite(str(root / split / f"r_{i}.png"), np.full((HEIGHT, WIDTH, 4), 255, np.uint8))
 
 
-def change(root: Path, **values: Any) -> None:
-    path = root / "transforms_train.json"
-    data = json.loads(path.read_text())
-    for key, value in values.items():
-        (data if key == "camera_angle_x" else data["frames"][2])[key] = value
-    path.write_text(json.dumps(data))
-
-
 def test_images_lie_on_the_background_and_alpha_is_the_mask(tmp_path: Path) -> None:
     write(tmp_path)
     cv2.imwrite(str(tmp_path / "train" / "r_1.png"), np.full((HEIGHT, WIDTH, 4), (0, 100, 200, 51), np.uint8))
@@ -107,7 +99,10 @@ def test_first_points_are_random_in_the_cube_and_the_same_each_time(tmp_path: Pa
 )
 def test_wrong_fields(tmp_path: Path, values: dict[str, Any], message: str) -> None:
     write(tmp_path)
-    change(tmp_path, **values)
+    path = tmp_path / "transforms_train.json"
+    data = json.loads(path.read_text())
+    (data if "camera_angle_x" in values else data["frames"][2]).update(values)
+    path.write_text(json.dumps(data))
     with pytest.raises(DataError, match=message):
         load_scene(tmp_path)
 

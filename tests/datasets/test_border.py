@@ -61,15 +61,11 @@ def test_the_scene_is_not_taken_for_a_border(scene):
     assert border_transmittance(torch.zeros(3, 3, 144, 192)) is None
 
 
-def with_border(scene, light):
+def with_border(scene, light, known=True):
     def put(views):
-        return replace(views, images=views.images * light, light=light)
+        return replace(views, images=views.images * light, light=light if known else None)
 
     return replace(scene, train=put(scene.train), test=put(scene.test))
-
-
-def ignored(scene):
-    return replace(scene, train=replace(scene.train, light=None), test=replace(scene.test, light=None))
 
 
 def test_a_render_is_measured_behind_the_border(scene):
@@ -97,7 +93,7 @@ def test_a_fit_renders_the_scene_without_the_border(scene):
     scene = replace(scene, train=views, test=views.select([0]))
     light, points = behind(left=3.0, top=0.0, right=0.0), choose_points(scene, FitConfig(init="sift"))
     edges = []
-    for views in (scene, with_border(scene, light), ignored(with_border(scene, light))):
+    for views in (scene, with_border(scene, light), with_border(scene, light, known=False)):
         trainer = Trainer(
             views, make_plan(views, FitConfig(steps=200, evaluations=1, training_background="scene")), points
         )

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from kgs import backends
+from kgs.datasets import synthetic_scene
 
 HERE = Path(__file__).parent
 
@@ -18,3 +19,8 @@ def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
         values = getattr(getattr(item, "callspec", None), "params", {})
         if item.path.is_relative_to(HERE) and values.get("each_backend") == "torch":
             item.add_marker(pytest.mark.slow)
+
+
+@pytest.fixture(scope="session")
+def arc():
+    return synthetic_scene("arc", train_views=6, test_views=2, size=(72, 96))

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from kgs.datasets import synthetic_scene
 from kgs.fit.config import PRESETS, FitConfig
 from kgs.fit.exposure import LEAST_RATIO, decide_exposure, estimate_gains, with_exposure
 from kgs.fit.measures import measure
@@ -77,11 +76,6 @@ def test_gains_are_used_only_where_photos_differ(tiny_plan):
 # -- of a scene -----------------------------------------------------------------------------------------------------
 
 CONFIG = FitConfig(steps=150, evaluations=1, sh_degree=0)
-
-
-@pytest.fixture(scope="module")
-def arc():
-    return synthetic_scene("arc", train_views=6, test_views=2, size=(72, 96))
 
 
 @pytest.fixture(scope="module")

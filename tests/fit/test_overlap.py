@@ -75,7 +75,7 @@ def test_a_fit_goes_on_with_the_rate_that_was_decided(scene, tmp_path):
     assert resumed.plan.config.drop == 0
 
 
-def test_a_whole_fit_says_what_it_decided(scene):
+def test_a_whole_fit_says_what_it_decided():
     """Eight photos of the room, all of which show most places."""
     large = synthetic_scene("room", train_views=8, test_views=1, size=(96, 128))
     fit = fit_scene(large, CONFIG)

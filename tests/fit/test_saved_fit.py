@@ -36,27 +36,14 @@ def test_entries_that_older_files_lack_have_their_defaults(tmp_path: Path) -> No
     assert read_settings(path)[0] == SceneRequest("/photos")
 
 
+WRONG = {"scene": ("", 3, "a\0b"), "train_views": (0, True), "downscale": (0.5, "2"), "hold_out": (1, -2, False)}
+WRONG |= {"background": ("red",), "points": (["none"],), "photos": (1,), "roll": ("90",), "title": (None,)}
+
+
 @pytest.mark.parametrize(
     ("request_", "field"),
-    [
-        (None, "request"),
-        ({}, "request.scene"),
-        (VALUES | {"scene": ""}, "request.scene"),
-        (VALUES | {"scene": 3}, "request.scene"),
-        (VALUES | {"scene": "a\0b"}, "request.scene"),
-        (VALUES | {"train_views": 0}, "request.train_views"),
-        (VALUES | {"train_views": True}, "request.train_views"),
-        (VALUES | {"downscale": 0.5}, "request.downscale"),
-        (VALUES | {"downscale": "2"}, "request.downscale"),
-        (VALUES | {"hold_out": 1}, "request.hold_out"),
-        (VALUES | {"hold_out": -2}, "request.hold_out"),
-        (VALUES | {"hold_out": False}, "request.hold_out"),
-        (VALUES | {"background": "red"}, "request.background"),
-        (VALUES | {"points": ["none"]}, "request.points"),
-        (VALUES | {"photos": 1}, "request.photos"),
-        (VALUES | {"roll": "90"}, "request.roll"),
-        (VALUES | {"title": None}, "request.title"),
-    ],
+    [(None, "request"), ({}, "request.scene")]
+    + [(VALUES | {name: value}, f"request.{name}") for name, values in WRONG.items() for value in values],
 )
 def test_wrong_requests_are_named(tmp_path: Path, request_: Any, field: str) -> None:
     path = written(tmp_path / "config.json", request_)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from kgs.datasets import synthetic_scene
 from kgs.datasets.synthetic import synthetic_depths
 from kgs.fit import FitConfig, InitialPoints, view_dependence
 from kgs.fit.plan import make_plan, with_pace
@@ -134,11 +133,6 @@ def decided(scene, config=OPEN):
     plan = decide(make_plan(scene, config), points)
     assert decide(make_plan(scene, config), points) == plan
     return plan
-
-
-@pytest.fixture(scope="module")
-def arc():
-    return synthetic_scene("arc", train_views=6, test_views=0, size=(72, 96))
 
 
 def test_surfaces_of_one_colour_need_no_harmonics(arc):
