@@ -147,7 +147,8 @@ def _with_masks(root: Path, frame_set: FrameSet, folder: Path | None) -> FrameSe
     parts = [frame_set.frames, frame_set.test or ()]
     if folder is None and any(frame.mask for frames in parts for frame in frames):
         return frame_set
-    found = find_masks([frame.path for frames in parts for frame in frames], folder or mask_folder(root))
+    photos = [frame.path for frames in parts for frame in frames]
+    found = find_masks(photos, mask_folder(root) if folder is None else folder)
     frames, test = ([replace(frame, mask=found.get(frame.path)) for frame in frames] for frames in parts)
     return replace(frame_set, frames=frames, test=None if frame_set.test is None else test)
 
@@ -158,8 +159,8 @@ def _mask_notes(frames: Sequence[Frame], train: Views, absent: bool) -> list[str
     if not masked:
         return []
     share = "" if train.counted is None else f", {1 - float(train.counted.float().mean()):.0%} of the training pixels"
-    meaning = "nothing is there" if absent else f"is looked away from{share}"
-    return [f"masks of {masked} of {len(frames)} photos: what is black in them {meaning}"]
+    meaning = "treated as empty" if absent else f"ignored{share}"
+    return [f"masks of {masked} of {len(frames)} photos: black pixels are {meaning}"]
 
 
 def _with_border(train: Views) -> Views:

@@ -48,8 +48,9 @@ class Mask(NamedTuple):
 
 
 def mask_folder(root: Path) -> Path | None:
-    """The folder of masks beside a scene's photos, None if there is none."""
-    return next((root / name for name in MASK_FOLDERS if (root / name).is_dir()), None)
+    """The folder of masks beside a scene's photos, None if there is none with a picture in it."""
+    folders = (root / name for name in MASK_FOLDERS if (root / name).is_dir())
+    return next((folder for folder in folders if list_images(folder)), None)
 
 
 def find_masks(photos: Sequence[Path], folder: Path | None) -> dict[Path, Mask]:

@@ -72,9 +72,10 @@ def _git(path: Path, *arguments: str) -> str:
 def peak_rss_mb() -> int:
     """Largest resident memory of this process so far, in MiB; 0 where the system does not report it (Windows)."""
     status = Path("/proc/self/status")
-    if status.exists():  # on Linux, getrusage may return the peak of the parent process
-        line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
-        return round(int(line.split()[1]) / 2**10)
+    lines = status.read_text().splitlines() if status.exists() else []
+    for line in lines:  # on Linux, getrusage may return the peak of the parent process
+        if line.startswith("VmHWM"):
+            return round(int(line.split()[1]) / 2**10)
     try:
         import resource
     except ModuleNotFoundError:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from kgs.app.files.results_folder import CHECKPOINT, complete_stopped_move
+from kgs.backends import former_or_auto
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 from kgs.fit.checkpoint import newest_checkpoint
@@ -47,7 +48,8 @@ def load_fit(
     Args:
         out: the folder of the results.
         device: for the Gaussians.
-        backend: of the renderer; "auto": that of the fit, on a GPU the fastest.
+        backend: of the renderer; "auto": that of the fit where that is there and runs on the device, else the
+            fastest.
         say: gets the notes of the loader.
 
     Raises:
@@ -59,8 +61,8 @@ def load_fit(
     metrics = read_json(out / "metrics.json")
     values, damage = newest_checkpoint(path)
     model = _read_model(path, values).to(device)
-    if backend == "auto" and model.means.device.type == "cpu":
-        backend = values["backend"]
+    if backend == "auto":
+        backend = former_or_auto(values["backend"], model.means.device)
     if values["step"] != metrics.get("steps"):
         whose = "that of the previous checkpoint, " if damage else ""
         reason = f"expected that of metrics.json, {metrics.get('steps')}, got {whose}{values['step']}: resume the fit"

@@ -76,6 +76,14 @@ class SceneRequest:
         largest = min(DETAILS["high"].size, round(side * (self.downscale or 1.0)))
         return largest if largest > _FINER * side else None
 
+    def shrink(self, base: Path, scene: Scene) -> float:
+        """By what factor the photos of `scene` are smaller than the largest that its folder has."""
+        factor = self.downscale or 1.0
+        if self.photo_folder:
+            largest = load_scene(base / self.scene, photos=False, hold_out=0).train.images.shape[-1]
+            factor *= largest / scene.train.images.shape[-1]
+        return factor
+
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for config.json."""
         return asdict(self)

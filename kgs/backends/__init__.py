@@ -17,7 +17,7 @@ from .cpu import CpuBackend
 from .gpu import GpuBackend
 from .torch import TorchBackend
 
-__all__ = ["BACKENDS", "Backend", "available", "check_backend", "choose", "resolve", "takes_kernels"]
+__all__ = ["BACKENDS", "Backend", "available", "check_backend", "choose", "former_or_auto", "resolve", "takes_kernels"]
 
 # "auto" takes the first that covers a call and is trusted
 BACKENDS: tuple[Backend, ...] = (CpuBackend(), GpuBackend(), TorchBackend())
@@ -51,6 +51,12 @@ def resolve(name: str, device: Device) -> str:
             return backend.name
     devices = next(" and ".join(backend.devices or ()) for backend in BACKENDS if backend.name == name)
     raise ValueError(f'backend: expected "auto" or "torch" on {device}, got "{name}", which runs on {devices} alone')
+
+
+def former_or_auto(name: str, device: Device) -> str:
+    """The name of the backend of an earlier fit where that is installed and runs on the device, else "auto"."""
+    former = [backend for backend in BACKENDS if backend.name == name]
+    return name if any(backend.runs_on(device) and backend.is_installed() for backend in former) else "auto"
 
 
 def choose(name: str, stage: str, device: Device, covers: Callable[[Backend], bool]) -> Backend:

@@ -41,7 +41,7 @@ __all__ = [
     "measure",
 ]
 
-# the other names import OpenCV and trimesh
+# the other names import torch, OpenCV and safetensors
 __getattr__, __dir__ = lazy_names(
     __name__,
     {

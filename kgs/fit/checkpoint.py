@@ -35,8 +35,8 @@ def previous(path: Path) -> Path:
 def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
     """Write nested dicts, with text as keys, of tensors and JSON values; the file at `path` becomes the previous one.
 
-    Whenever the process dies, `newest_checkpoint` finds the old or the new state; after an OSError both files are as
-    they were. Any other value is a TypeError, and a plain number that is not finite a ValueError.
+    Whenever the process dies, and after an OSError, `newest_checkpoint` finds the old or the new state. Any other value
+    is a TypeError, and a plain number that is not finite a ValueError.
     """
     tensors: dict[str, Tensor] = {}
     text = json.dumps(_take_tensors(state, tensors), allow_nan=False, separators=(",", ":"))
@@ -52,16 +52,20 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
             os.replace(path, previous(path))
         os.replace(temporary, path)
         if os.name == "posix":  # the new names survive a power cut, where the file system can promise that
-            descriptor = os.open(path.parent, os.O_RDONLY)
-            try:
-                with suppress(OSError):
-                    os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
+            with suppress(OSError):
+                _sync_folder(path.parent)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def newest_checkpoint(path: Path) -> tuple[dict[str, Any], str]:

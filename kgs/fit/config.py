@@ -109,8 +109,8 @@ class FitConfig:
     """The settings of one fit. NumPy's numbers are accepted and become Python's.
 
     `fit_scene` and the command use all entries. A `Trainer` is given its initial points and removes nothing after the
-    last step: it ignores init, init_file, init_points, draw and keep_all, and takes a `sh_degree` of None as 0, a
-    `drop` of None as 0.3.
+    last step: it ignores init, init_file, init_points, draw and keep_all. Unless :func:`kgs.fit.run.decide` was asked,
+    it takes a `sh_degree` of None as 0, a `drop` of None as 0.3, and all photos as equally exposed.
 
     Args:
         steps: number of training steps, to which the recipe's counts are scaled. Unless given: 900 for up to three
@@ -122,7 +122,8 @@ class FitConfig:
         sh_degree: degree of the view-dependent colour (spherical harmonics), 0 to 3. Unless given: 3
             if the colours of the training views depend on the direction, else 0.
         exposure: whether each training photo has a gain in each channel, which is estimated before the fit and held.
-            auto: where photos differ by a factor of 1.3 or more, and gains explain it. each: always. same: never.
+            auto: where photos differ by a factor of 1.3 or more, and gains explain it. each: always, if the initial
+            points are dense. same: never.
         refine_poses: optimise the poses of the training cameras too. It helps if they are half a degree or more off;
             accurate poses get slightly worse. The mean and the spread of the poses stay, and so do test cameras.
         coarse: share of the steps, from the start, that use the training views at half the width; in [0, 1]. Unless

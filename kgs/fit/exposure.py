@@ -13,6 +13,7 @@ it rises after an affine fit of colours; and shading, reflections and noise give
 gains are used only where photos differ much, and gains explain it (docs/photos.md has measurements).
 """
 
+import warnings
 from dataclasses import replace
 from typing import Any
 
@@ -37,7 +38,7 @@ def decide_exposure(plan: Plan, points: InitialPoints) -> Plan:
 
     Args:
         plan: of the fit.
-        points: its initial points; without patches there are no gains.
+        points: its initial points; without patches there are no gains, and a warning if they were asked for.
 
     Returns:
         The plan. If gains are used, its `needs` have under "exposure" a dict: "gains", three numbers for each
@@ -45,7 +46,14 @@ def decide_exposure(plan: Plan, points: InitialPoints) -> Plan:
         "n", the number of patches.
     """
     how = plan.config.exposure
-    if how == "same" or points.patches is None or len(points.patches) < MIN_PATCHES:
+    if how == "same":
+        return plan
+    if points.patches is None or len(points.patches) < MIN_PATCHES:
+        if how == "each":
+            warnings.warn(
+                "exposure: the initial points come without patches of colour, so photos are taken as equally exposed",
+                stacklevel=2,
+            )
         return plan
     gains, left = estimate_gains(points.patches)
     ratio = float((gains.amax(0) / gains.amin(0)).max())

@@ -15,7 +15,6 @@ _INIT_NOTES = {
     "file": "initial points of a file",
 }
 _CONVENTIONS = {
-    "psnr": "mean over views, renders clamped to [0, 1], all pixels and channels",
     "recolored": "test views, each channel of a render with the gain and offset that fit its photo best",
     "ssim": "Kornia, 11 x 11, reflect padded; ssim_zero_padded as the published tables",
     "lpips": "VGG16 v0.1, inputs in [-1, 1]; lpips_vgg_unscaled with inputs in [0, 1] as the published tables",
@@ -35,16 +34,20 @@ def measure(fit: Fit, lpips: Lpips | None = None) -> dict[str, Any]:
         differ in exposure, "recolored" has the measures of test views after an affine fit of their colours.
 
     Raises:
-        ValueError: the fit has no settings.
+        ValueError: the fit has no settings, or no history, as one that was read from its folder.
     """
     scene = fit.scene
     config = fit.settings
     if config is None:
         raise ValueError("fit: expected a fit of kgs, which has settings, got a splat alone")
+    if not fit.history:
+        raise ValueError("fit: expected one that was just made, got one that was read from its folder: it has metrics")
     init_note = _INIT_NOTES.get(config.init, "initial points from training views alone")
     poses = "poses as given (estimated with all views in real scenes, the field's protocol)"
     if fit.history["poses"] is not None:
         poses += ", those of the training views refined by the fit"
+    everywhere = all(views.counted is None for views in (scene.train, scene.test))
+    pixels = "all pixels" if everywhere else "the pixels that count; SSIM and LPIPS take the others as equal"
     is_exposed = scene.train.gains is not None and len(scene.test) > 0
     return {
         "test": evaluate(fit.render, scene.test, lpips) if len(scene.test) else None,
@@ -63,6 +66,7 @@ def measure(fit: Fit, lpips: Lpips | None = None) -> dict[str, Any]:
             "image_size": list(scene.train.images.shape[-2:]),
             "background": scene.background.tolist(),
             "init": f"{config.init}: {init_note}; {poses}",
+            "psnr": f"mean over views, renders clamped to [0, 1], all channels, {pixels}",
             **_CONVENTIONS,
         },
         "versions": versions(),

@@ -96,7 +96,7 @@ def with_pace(config: FitConfig, views: int) -> FitConfig:
 
 
 def timetable(config: FitConfig) -> Timetable:
-    """Scale the recipe's counts by steps / 10 000.
+    """Scale the recipe's counts by steps / `recipe.steps`.
 
     A short fit shortens the densification interval only as far as it needs to densify about 20 times, and never below
     10 steps: with mean gradients over few steps the number of Gaussians explodes. `reset_recovery` skips resets.

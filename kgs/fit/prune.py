@@ -11,6 +11,7 @@ from kgs.datasets.scene import Views
 from kgs.metrics.evaluate import comparable
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
+from kgs.types import RasterOptions
 
 from .fit import Fit
 
@@ -32,13 +33,7 @@ def prune(fit: Fit) -> Fit:
     if fit.settings is not None and fit.settings.keep_all:
         return fit
     model = fit.model
-    weights = contributions(
-        model,
-        fit.scene.train,
-        fit.options.near_plane,
-        max_bytes=fit.options.max_bytes,
-        backend=fit.backend,
-    )
+    weights = contributions(model, fit.scene.train, fit.options, fit.backend)
     levels = training_levels(fit)
     for limit in WEIGHTS:
         rows = weights > limit
@@ -65,8 +60,10 @@ def _part(fit: Fit, rows: Tensor, sh_degree: int) -> Fit:
 def _with_fewest_harmonics(fit: Fit, pruned: Fit, levels: list[float]) -> Fit:
     """The pruned fit with the lowest degree that changes no image."""
     most = fit.model.sh_degree
+    if not most:
+        return pruned
     views = fit.scene.train
-    cameras = [views.camera(i) for i in range(len(views))] if most else []
+    cameras = [views.camera(i) for i in range(len(views))]
     images = [pruned.render(camera) for camera in cameras]
     rows = pruned.part["rows"].to(fit.device)
     for degree in range(most + 1):
@@ -88,12 +85,12 @@ def training_levels(fit: Fit) -> list[float]:
     return [comparable(fit.psnr(views.select([i]))) for i in range(len(views))]
 
 
-def contributions(model: GaussianModel, views: Views, near_plane: float, **options: Any) -> Tensor:
+def contributions(model: GaussianModel, views: Views, options: RasterOptions, backend: str = "auto") -> Tensor:
     """The sum of each Gaussian's blending weights over the pixels of all views, `(N,)`.
 
-    It is the gradient of the sum of all images with respect to the Gaussian's colour. `options` go to the renderer.
+    It is the gradient of the sum of all images with respect to the Gaussian's colour.
     """
-    renderer = GaussianRenderer(near_plane=near_plane, antialiased=model.antialiased, **options).eval()
+    renderer = GaussianRenderer(options=options, backend=backend).eval()
     with torch.no_grad():
         gaussians = model()
     colors = torch.zeros_like(gaussians.means).requires_grad_()

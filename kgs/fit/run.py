@@ -58,6 +58,9 @@ def choose_points(scene: Scene, config: FitConfig, stage: Stage = silent) -> Ini
         if len(scene.points) == 0:
             reason = f"expected points of the layout itself for the init {kind!r}, got none"
             raise DataError(scene.root, "points", reason)
+        if (kind == "model-points") != (scene.init_kind == "model-points"):
+            reason = f"expected points for the init {kind!r}, got {scene.init_kind!r}: load_scene(points=...) chooses"
+            raise DataError(scene.root, "points", reason)
         check_in_view(scene.points, scene.train, scene.root)
         return InitialPoints(scene.points, scene.point_colors, scene.init_kind)
     views = scene.train if scene.finer is None else scene.finer

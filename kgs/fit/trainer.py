@@ -220,7 +220,7 @@ class Trainer:
         self._use(state)
 
     def save(self, path: str | PathLike[str], part: dict[str, Any] | None = None) -> None:
-        """Write a checkpoint; after an OSError the checkpoints that were there are untouched.
+        """Write a checkpoint; after an OSError one that was there is still there.
 
         Args:
             path: the file to write.

@@ -60,7 +60,8 @@ def evaluate(
             raise ValueError(f"render: expected finite values for {name}, got NaN or infinity")
         shown, photo, share = views.compared(index, image)
         if recolor:
-            shown, _, _ = views.compared(index, recolored(image, shown, photo))
+            counted = None if views.counted is None else views.counted[index]
+            shown, _, _ = views.compared(index, recolored(image, shown, photo, counted))
         shares.append(share)
         rows.append(_measure(shown, photo[None], share, lpips))
     columns = {key: [row[key] for row in rows] for key in MEASURES}
@@ -70,13 +71,15 @@ def evaluate(
     return {**means, "views": [{"name": name, **row} for name, row in zip(views.names, rows, strict=True)]}
 
 
-def recolored(image: Tensor, shown: Tensor, photo: Tensor) -> Tensor:
+def recolored(image: Tensor, shown: Tensor, photo: Tensor, counted: Tensor | None = None) -> Tensor:
     """A render `(1, 3, H, W)` with the gain and offset of each channel that fit `shown` to the photo `(3, H, W)`.
 
-    `shown` is the render as it is compared with the photo; least squares in float64.
+    `shown` is the render as it is compared with the photo; least squares in float64 over the pixels `(1, H, W)` that
+    are counted, or over all.
     """
-    x = shown[0].flatten(1).double()
-    y = photo.flatten(1).double()
+    every = slice(None) if counted is None or not bool(counted.any()) else counted.flatten().to(shown.device)
+    x = shown[0].flatten(1)[:, every].double()
+    y = photo.flatten(1)[:, every].double()
     mean_x = x.mean(1, keepdim=True)
     mean_y = y.mean(1, keepdim=True)
     variance = (x - mean_x).square().sum(1, keepdim=True)

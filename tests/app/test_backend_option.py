@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from command import run
 
 from kgs import DataError, backends
 from kgs.app.files.results_folder import CHECKPOINT
@@ -76,7 +75,9 @@ def test_a_resumed_fit_goes_on_with_what_it_was_begun_with(installed, scene, poi
         Trainer.resume(scene, replace(CONFIG, backend=other), tmp_path / CHECKPOINT)
 
 
-def test_versions_say_where_numba_is_missing(monkeypatch, capsys):
-    monkeypatch.setattr("kgs.machine.versions", lambda: {"kgs": "1"})
-    assert run("--version") == 0
-    assert "numba is not installed" in capsys.readouterr().out
+def test_a_fit_is_shown_where_its_backend_is_not_there(installed):
+    cpu, gpu = torch.device("cpu"), torch.device("cuda")
+    assert [backends.former_or_auto(name, cpu) for name in ("numba", "torch", "triton")] == ["numba", "torch", "auto"]
+    assert backends.former_or_auto("numba", gpu) == "auto"
+    installed(False)
+    assert backends.former_or_auto("numba", cpu) == "auto"

@@ -1,4 +1,4 @@
-"""What other programs get beside the PLY file: the list of cameras, the world upright, PNGs with alpha."""
+"""What other programs get beside the PLY file: a compressed one, the cameras, the world upright, PNGs with alpha."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from compressed_reader import decode, header
 from factories import random_model, random_views
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
 import kgs
 from kgs.app.cli.render import render
-from kgs.app.files import exports, film
+from kgs.app.files import exports
 from kgs.app.files.cameras import camera_list, upright
 from kgs.app.files.outputs import EXPORTS
 from kgs.app.files.ownership import is_own
@@ -87,14 +88,36 @@ def test_upright() -> None:
         torch.testing.assert_close(found @ found.T, torch.eye(3).double())
 
 
-@pytest.fixture
-def fit(monkeypatch: Any) -> Fit:
-    """A fit whose film has three frames."""
-    monkeypatch.setattr(film, "FRAMES", 3)
+def fit_of(model: kgs.GaussianModel, origin: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Fit:
+    """A fit with this splat, of a scene with this origin."""
     none = torch.zeros(0, 3)
-    origin = torch.zeros(3, dtype=torch.float64)
-    scene = Scene(random_views(2), random_views(1), none, none, "none", origin, torch.zeros(3), Path())
-    return Fit(scene, random_model(), kgs.RasterOptions())
+    offset = torch.tensor(origin, dtype=torch.float64)
+    scene = Scene(random_views(2), random_views(1), none, none, "none", offset, torch.zeros(3), Path())
+    return Fit(scene, model, kgs.RasterOptions())
+
+
+@pytest.fixture
+def fit() -> Fit:
+    return fit_of(random_model())
+
+
+@pytest.mark.parametrize(
+    ("origin", "shift"), [((50.0, -30.0, 0.0), (50.0, -30.0, 0.0)), ((5e8, -3e8, 0.0), (0.0, 0.0, 0.0))]
+)
+def test_the_compressed_file_has_the_axes_of_the_ply_where_floats_can_hold_them(
+    tmp_path: Path, origin: Any, shift: Any
+) -> None:
+    """In map coordinates its origin is that of the scene, the mean of the training cameras' centres."""
+    model = random_model(100, 0)
+    exports.write_exports(fit_of(model, origin), tmp_path)
+    path = tmp_path / "splat.compressed.ply"
+    np.testing.assert_allclose(decode(path)["means"], model.means.detach().numpy() + shift, atol=0.005)
+    assert header(path)[0][2] == "element chunk 1"
+
+
+def test_a_fit_without_gaussians_has_no_compressed_file(tmp_path: Path) -> None:
+    exports.write_exports(fit_of(random_model(0)), tmp_path)
+    assert not (tmp_path / "splat.compressed.ply").exists()
 
 
 def test_the_film_that_cannot_be_is_a_note(fit: Fit, tmp_path: Path, monkeypatch: Any) -> None:

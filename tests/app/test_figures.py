@@ -75,6 +75,11 @@ def test_the_peak_of_memory():
     assert block[-1]
 
 
+def test_a_system_that_reports_no_peak_in_its_status(monkeypatch):
+    monkeypatch.setattr(Path, "read_text", lambda *_, **__: "VmSize: 5000 kB\nVmRSS: 3000 kB\n")
+    assert peak_rss_mb() > 10
+
+
 @pytest.mark.parametrize("name", ["foo", "", "cuda:x", "meta", "cuda:99", "privateuseone"])
 def test_a_device_that_is_not_there_is_one_line(name):
     with pytest.raises(ValueError, match=r"^device: expected cpu or a GPU of this machine, got .*$") as caught:

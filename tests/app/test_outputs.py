@@ -17,8 +17,6 @@ from kgs.app.files.staging import Staging
 from kgs.errors import DataError
 from kgs.json_files import write_json, write_whole
 
-CURVE = [{"step": 1, "seconds": 0.1, "test_psnr": 20.0, "train_psnr": None}]
-
 
 def test_each_view_has_a_picture_of_its_own():
     views = ["v.png", "v.bmp", "V.PNG", "images/v.png", "images_v.png", "é.png", "e\u0301.png", ".hidden", "a\nb.png"]

@@ -120,6 +120,8 @@ def test_nothing_else_is_overwritten(fitted: Path, tmp_path: Path, capsys: Any) 
         (fitted / "splat.ply", tmp_path / "out", "--out"),
         (fitted / "splat.ply", other / "splat.ply", "splat.ply"),
         (fitted / "splat.ply", tmp_path / "none" / "splat.ply", "none"),
+        (fitted / "splat.ply", fitted / "splat.ply", "--out"),
+        (fitted / "splat.ply", fitted / "splat.compressed.ply", "splat.compressed.ply"),  # of the fit
     ):
         assert run("scale", splat, *by, "-o", out) == 2
         assert field in one_line(capsys)

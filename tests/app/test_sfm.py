@@ -13,7 +13,7 @@ from init_point_scenes import WIDTH, focal_length
 from photo_folders import NAMES, close, planes, poses, write_photos, write_planes
 
 from kgs.app.sfm import pose_photos
-from kgs.app.sfm.write import write_model
+from kgs.app.sfm.write import leveling, write_model
 from kgs.datasets import load_scene
 from kgs.errors import DataError
 
@@ -214,3 +214,17 @@ def test_real_photos_against_given_poses(tmp_path, kgs_data, name, views, rotati
     }
     for a, b in combinations(sorted(true), 2):
         assert degrees(found[b] @ found[a].T @ (true[b] @ true[a].T).T) < rotation
+
+
+@pytest.mark.parametrize(
+    "vector", [(0.0, -2.0, 0.0), (0.0, 3.0, 0.0), (0.1, 1.0, 0.1), (1.0, 0.2, -3.0), (0.0, 0.0, 1.0)]
+)
+def test_what_is_up_is_turned_up(vector):
+    """An upside-down camera, too: half a turn about its view."""
+    vector = np.array(vector)
+    turned = leveling(vector)
+    np.testing.assert_allclose(turned @ vector, [0, -np.linalg.norm(vector), 0], atol=1e-12)
+    np.testing.assert_allclose(turned @ turned.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(turned) == pytest.approx(1.0)
+    assert np.trace(leveling(np.zeros(3))) == 3
+    assert leveling(np.array([0.0, 1.0, 0.0]))[2, 2] == 1

@@ -133,3 +133,20 @@ def test_frames_are_of_a_video_and_three_at_least(tmp_path, frames, folder, caps
         cv2.imwrite(str(tmp_path / "0.png"), np.zeros((8, 8, 3), np.uint8))
     assert run("fit", tmp_path if folder else video, "-o", tmp_path / "out", "--frames", frames) == 2
     assert "--frames: expected" in capsys.readouterr().err
+
+
+def test_a_video_whose_header_has_no_number_of_frames(tmp_path, monkeypatch):
+    """As recorders write it that do not know yet how long it will be."""
+
+    class Uncounted(cv2.VideoCapture):
+        def get(self, key):
+            return -2.2e17 if key == cv2.CAP_PROP_FRAME_COUNT else super().get(key)
+
+    video = write_video(tmp_path / "clip.avi", np.linspace(0, 20, 30).tolist())
+    expected = take(video, 4)
+    monkeypatch.setattr(cv2, "VideoCapture", Uncounted)
+    assert take(video.rename(tmp_path / "same.avi"), 4) == expected
+
+
+def test_as_many_frames_as_are_asked_for_where_they_are_unevenly_spread(tmp_path):
+    assert take(write_video(tmp_path / "clip.avi", [0.0, 5.0, 5.2]), 3) == [0, 1, 2]

@@ -90,6 +90,8 @@ def test_a_folder_of_photos_becomes_a_fit(folder, tmp_path, capsys):
     assert "4 training and 0 test views of 96x72" in said
     assert "<title>photos4</title>" in (out / "index.html").read_text(encoding="utf-8")
     assert "no photo was held out" in said
+    assert json.loads((out / "metrics.json").read_text())["test"] is None
+    assert not (out / "test").exists()
     assert f"--cameras {out}" in said
     request = json.loads((out / "config.json").read_text())["request"]
     assert (request["scene"], request["hold_out"], request["downscale"]) == (".", 0, 1.0)

@@ -23,7 +23,7 @@ LEFT[:, 8:] = 255  # black on the left: only the right half is kept
 
 
 def write_mask(path: Path, mask: np.ndarray = LEFT) -> Path:
-    path.parent.mkdir(exist_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(path), mask)
     return path
 
@@ -196,3 +196,11 @@ def test_only_pixels_that_count_are_measured(half: Views) -> None:
     assert "counted" not in whole
     renders = iter(torch.where(half.counted[:, None], half.images + 0.01, 0.5).clamp(0, 1)[:, None])
     assert mean_psnr(lambda _: next(renders), half) == pytest.approx(shown["psnr"], abs=1e-3)
+
+
+def test_a_folder_of_masks_without_pictures_is_passed_over_unless_it_is_named(tmp_path: Path) -> None:
+    write_llff(tmp_path)
+    write_mask(tmp_path / "masks" / "of_another_kind.txt.d" / "0.png")
+    assert load_scene(tmp_path, hold_out=0).train.counted is None
+    with pytest.raises(DataError, match="masks: "):
+        load_scene(tmp_path, hold_out=0, masks=tmp_path / "masks")

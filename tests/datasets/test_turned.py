@@ -10,6 +10,8 @@ import torch
 from init_point_scenes import painted_planes
 from kornia.geometry.camera import PinholeCamera
 
+from kgs import GaussianModel, GaussianRenderer
+from kgs.app.cli.page import in_frame_of
 from kgs.app.files.cameras import as_taken, shown
 from kgs.datasets import load_scene
 from kgs.datasets.scene import Views
@@ -86,3 +88,22 @@ def test_a_turned_photo_is_shown_as_it_was_taken(tmp_path: Path):
     again = shown(views, 90.0)
     assert [tuple(part.images.shape[-2:]) for part in again] == [(240, 180), (180, 240), (240, 180)]
     assert shown(Views(views.cameras, views.images, views.names)) != []
+
+
+def test_photos_of_a_page_are_in_the_frame_of_all_though_most_of_them_are_of_the_rarer_kind(tmp_path: Path):
+    """Renders at the same camera, once turned and once as it was taken."""
+    root = write(tmp_path / "mixed", (0,))
+    scene = load_scene(root, hold_out=0, photos=False)
+    alone = load_scene(root, 1, hold_out=0)  # the first photo, which stands
+    assert scene.train.turned == (True, False, False)
+    assert alone.train.turned is None
+    moved = in_frame_of(scene, alone)
+    torch.manual_seed(0)
+    model = GaussianModel.from_points(
+        scene.train.cameras.extrinsics.new_tensor([[0.0, 0, 2]]) + torch.rand(50, 3), torch.rand(50, 3)
+    )
+    renderer = GaussianRenderer()
+    with torch.no_grad():
+        turned, taken = (renderer(model(), views.camera(0)).image[0] for views in (scene.train, moved))
+    assert float(taken.amax()) > 0.1
+    torch.testing.assert_close(torch.rot90(turned, 1, (1, 2)), taken, atol=1e-4, rtol=0)

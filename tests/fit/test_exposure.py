@@ -12,7 +12,7 @@ from kgs.fit.measures import measure
 from kgs.fit.plan import make_plan
 from kgs.fit.run import choose_points, decide, fit_scene
 from kgs.fit.trainer import Trainer
-from kgs.init_points import InitialPoints
+from kgs.init_points import InitialPoints, initial_points
 from kgs.init_points.patches import MIN_PATCHES, PatchColors
 from kgs.metrics.evaluate import evaluate, recolored
 
@@ -153,3 +153,20 @@ def test_recoloured_renders_fit_best():
         np.testing.assert_allclose(found[0, k].flatten().numpy(), best, atol=1e-5)
     flat = torch.full((1, 3, 5, 7), 0.25)
     torch.testing.assert_close(recolored(flat, flat, photo)[0].mean((1, 2)), photo.mean((1, 2)))
+
+
+def test_only_what_counts_is_recoloured_by():
+    """Pixels behind a mask are black in both pictures."""
+    draw = torch.Generator().manual_seed(0)
+    image = torch.rand(1, 3, 5, 8, generator=draw)
+    counted = torch.zeros(1, 5, 8, dtype=torch.bool)
+    counted[..., 4:] = True
+    photo = (0.6 * image[0] + 0.2) * counted
+    found = recolored(image, image * counted, photo, counted)
+    torch.testing.assert_close(found, 0.6 * image + 0.2)
+
+
+def test_gains_that_are_asked_for_and_cannot_be_estimated_are_said(arc):
+    plan = make_plan(arc, FitConfig(exposure="each", init="random"))
+    with pytest.warns(UserWarning, match="exposure: "):
+        assert decide_exposure(plan, initial_points(arc.train, "random", count=20)) == plan

@@ -46,7 +46,7 @@ def test_contributions_are_sums_of_blending_weights(each_backend, scene):
         double = PinholeCamera(camera.intrinsics.double(), camera.extrinsics.double(), camera.height, camera.width)
         total += render(one_each, double, near_plane=0.01).sum((0, 2, 3)).detach()
     assert float(total[:-1].max()) > 1.0
-    found = contributions(model, scene.train, near_plane=0.01).double()
+    found = contributions(model, scene.train, RasterOptions(near_plane=0.01)).double()
     np.testing.assert_allclose(found, total, atol=1e-4 * float(total.max()))
 
 

@@ -25,15 +25,22 @@ def check_roll(roll: float) -> None:
         raise ValueError(f"roll: expected degrees in [-360, 360], got {roll}")
 
 
-def check_file(out: Path, ending: str) -> None:
-    """Raise a ValueError or DataError unless a result can be written to this file, and is no file of the user's."""
-    from kgs.app.files.outputs import NOT_OWN
-    from kgs.app.files.ownership import is_own
+def check_file(out: Path, ending: str, command: str, source: Path | None = None) -> None:
+    """Raise a ValueError or DataError unless a command can write its result to this file.
 
-    if out.suffix != ending:
+    A file that is there has to be a former result of the same command, and not the file `source` that it reads.
+    """
+    from kgs.app.files.ownership import is_own, read_list
+
+    if out.suffix.lower() != ending:
         raise ValueError(f"out: expected a file that ends in {ending}, got {str(out)!r}")
-    if out.exists() and not is_own(out):
-        raise DataError(out, "", f"{NOT_OWN}, and would be overwritten: choose another file")
+    if out.exists():
+        if source is not None and out.samefile(source):
+            raise ValueError(f"out: expected another file than {str(source)!r}, which is read")
+        if not is_own(out) or out.name not in read_list(out.parent).get(command, {}):
+            raise DataError(
+                out, "", f"is no former result of kgs {command}, and would be overwritten: choose another file"
+            )
     if not out.absolute().parent.is_dir():
         raise DataError(out, "", "expected a file in a folder that is there")
 

@@ -64,7 +64,7 @@ def clean(
     fit = None
     if splat.is_dir():
         request, fit = load_fit(splat, device, backend, say)
-        downscale = request.downscale
+        downscale = request.shrink(splat, fit.scene)
         background = "white" if request.background == "white" else "black"
     elif cameras is not None:
         scene = load_cameras(cameras, downscale, photos=True, background=background)
@@ -95,7 +95,7 @@ def clean(
     if cleaned.needed:
         say(f"{cleaned.needed} others stay: without them a training view would lose more than it may")
     _say_levels(fit, cleaned)
-    options = [] if downscale is None else ["--downscale", f"{downscale:g}"]
+    options = ["--downscale", f"{downscale:g}"] if downscale is not None and downscale > 1.0 else []
     if background != "black":
         options += ["--background", background]
     say_next(as_line("kgs", "page", out, "--cameras", fit.scene.root, "-o", out.with_suffix(".html"), *options))
@@ -151,20 +151,13 @@ def check_clean(
     **_: Any,
 ) -> None:
     """Check the arguments of `kgs clean`."""
-    from kgs.app.files.ownership import is_own, read_list
     from kgs.datasets.options import check_options
 
-    from .checks import check_installed, check_results, check_scene
+    from .checks import check_file, check_installed, check_results, check_scene
 
     check_options(downscale, None)
     check_installed(device, backend)
-    if out.suffix != ".ply":
-        raise ValueError(f"out: expected a file that ends in .ply, got {str(out)!r}")
-    if not out.absolute().parent.is_dir():
-        raise DataError(out, "", "expected a file in a folder that is there")
-    is_former = is_own(out) and out.name in read_list(out.parent).get("clean", {})
-    if out.exists() and (not is_former or out.resolve() == splat.resolve()):
-        raise DataError(out, "", "is no former result of kgs clean, or SPLAT itself: choose another file")
+    check_file(out, ".ply", "clean", splat)
     if cameras is not None:
         check_scene(cameras)
     if splat.is_dir():

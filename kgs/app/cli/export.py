@@ -53,6 +53,4 @@ def check_export(ply: Path, out: Path, **_: Any) -> None:
     from .checks import check_file, check_installed
 
     check_installed("cpu", "auto")
-    check_file(out, ".ply")
-    if out.exists() and out.samefile(ply):
-        raise ValueError(f"out: expected another file than {str(ply)!r}, which keeps what is rounded in the new one")
+    check_file(out, ".ply", "export", ply)

@@ -17,10 +17,10 @@ from .options import Existing, Out
 
 
 def defaults(words: list[str]) -> dict[str, Any]:
-    """The default of `config`, which follows from --preset and --detail."""
+    """The default of `config`, which follows from --preset and, for the preset auto, from --detail."""
     preset = PRESETS.get(_value(words, "--preset"), PRESETS["auto"])
     detail = DETAILS.get(_value(words, "--detail"), DETAILS["normal"])
-    return {"config": replace(preset, **detail.entries)}
+    return {"config": replace(preset, **detail.entries) if preset is PRESETS["auto"] else preset}
 
 
 def _value(words: list[str], option: str) -> str:
@@ -77,8 +77,8 @@ def fit(
         mask_means: what black in a mask means. away: look away, somebody walked by. absent: nothing is there.
         preset: auto: what the training views need. paper: DropGaussian's rule and recipe, as published. plain: the same
             without dropping. See --preset paper --help-all.
-        detail: sets size, steps and initial points together. low: 378 pixels. high: 1000 pixels. Options given by name
-            win. See --detail high --help-all.
+        detail: sets size, steps and initial points together; with --preset paper or plain the size alone. low: 378
+            pixels. high: 1000 pixels. Options given by name win. See --detail high --help-all.
         resume: continue from the checkpoint in the folder of the results.
         title: of the page. Unless given: the name of the folder.
         photos: --no-photos leaves the photos out of the page.
@@ -157,9 +157,7 @@ def fit(
     posed = out if unposed else scene
     splat = published.folder / "splat.ply"
     renders = out / "renders"
-    shrink = request.downscale or 1.0
-    if request.photo_folder:
-        shrink *= load_scene(scene, photos=False, hold_out=0).train.images.shape[-1] / width
+    shrink = request.shrink(base, loaded)
     shrunk = ("--downscale", f"{shrink:g}") if shrink > 1.0 else ()
     say(f"{printable(splat)}: {metrics['gaussians']} Gaussians after {metrics['steps']} steps")
     if needless := left_out(metrics["needs"]):
@@ -167,7 +165,7 @@ def fit(
     if published.signal:
         say_next("the same command with --resume goes on where it stopped")
         return 128 + published.signal
-    finer = request.finer_side(loaded) if is_free else None
+    finer = request.finer_side(loaded) if is_free and preset == "auto" else None
     more = f"the same command with --detail high fits {finer} pixels instead of {max(height, width)}, and takes longer"
     say_next(
         f"open {as_line(out / 'index.html')} in a browser: the splat to look around in, and how good it is",

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from kgs.app.console import as_line, say, say_next
 from kgs.errors import printable
@@ -10,6 +10,9 @@ from kgs.fit.config import Backend, Background
 
 from .inputs import load_cameras, load_splat
 from .options import Existing, Out
+
+if TYPE_CHECKING:
+    from kgs.datasets.scene import Scene, Views
 
 
 def page(
@@ -57,8 +60,8 @@ def page(
         raise ValueError(f"downscale: expected photos of at least {WINDOW} pixels a side, got {width}x{height}")
     fit = load_splat(ply, scene, place, backend)
     few = spread(len(scene.train), MOST_PICTURES)
-    pictured = load_scene(cameras, len(few), downscale, hold_out=0, background=background).train
-    pictured = replace(pictured, cameras=scene.train.camera(few))  # in the frame of `scene`, whose offset differs
+    photographed = load_scene(cameras, len(few), downscale, hold_out=0, background=background)
+    pictured = in_frame_of(scene, photographed)
     fit = replace(fit, metrics={"views": evaluate(fit.render, pictured), "versions": versions()})
     with writing(out.parent, "page", [out.name]):
         cost = write_fit_page(
@@ -80,6 +83,18 @@ def page(
     say_next(f"open {as_line(out)} in a browser")
 
 
+def in_frame_of(scene: "Scene", again: "Scene") -> "Views":
+    """Training views of a scene that was loaded again, with cameras in the frame of `scene`, whose offset differs."""
+    from kgs.datasets.scene import pinholes
+
+    views = again.train
+    extrinsics = views.cameras.extrinsics.double()
+    shift = (scene.offset - again.offset).to(extrinsics)
+    extrinsics[:, :3, 3] += extrinsics[:, :3, :3] @ shift
+    height, width = views.images.shape[-2:]
+    return replace(views, cameras=pinholes(views.cameras.intrinsics, extrinsics.float(), (height, width)))
+
+
 def check_page(
     cameras: Path, out: Path, downscale: float | None, roll: float, device: str, backend: str, **_: Any
 ) -> None:
@@ -91,5 +106,5 @@ def check_page(
     check_roll(roll)
     check_options(downscale, None)
     check_installed(device, backend, "jinja2")
-    check_file(out, ".html")
+    check_file(out, ".html", "page")
     check_scene(cameras)

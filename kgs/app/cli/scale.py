@@ -89,10 +89,10 @@ def _point(text: str) -> list[float]:
 
 def check_scale(splat: Path, by: tuple[str, str, float], out: Path, **_: Any) -> None:
     """Check the arguments of `kgs scale`."""
-    from kgs.app.files.outputs import NOT_OWN, check_folder
-    from kgs.app.files.ownership import is_own, read_list
+    from kgs.app.files.outputs import check_folder
+    from kgs.app.files.ownership import read_list
 
-    from .checks import check_installed, check_results
+    from .checks import check_file, check_installed, check_results
 
     a, b, length = by
     if not (math.isfinite(length) and length > 0):
@@ -108,9 +108,4 @@ def check_scale(splat: Path, by: tuple[str, str, float], out: Path, **_: Any) ->
             raise DataError(out, "", "holds the results of kgs fit: choose another folder")
         return
     check_installed("cpu", "auto")
-    if out.suffix.lower() != ".ply":
-        raise ValueError(f"out: expected a file that ends in .ply, got {str(out)!r}")
-    if out.exists() and not is_own(out):
-        raise DataError(out, "", f"{NOT_OWN}, and would be overwritten: choose another file")
-    if not out.absolute().parent.is_dir():
-        raise DataError(out, "", "expected a file in a folder that is there")
+    check_file(out, ".ply", "scale", splat)

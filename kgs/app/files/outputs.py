@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 FILMS = ("turntable.mp4", "turntable.webm")  # a fit writes one of them
 # for other programs, and for messengers
 EXPORTS = ("cameras.json", "splat.compressed.ply", "splat.glb", "preview.jpg", *FILMS)
-NOT_OWN = "was not written by kgs, or was changed since (a copy: cp -a keeps what tells that it was not)"
+NOT_OWN = "was not written by kgs, or was changed since (it knows its files by size and time: copy folders with cp -a)"
 _SCENES = ("poses_bounds.npy", "sparse", "transforms.json", "transforms_train.json")
 _ENDING = r"(?<=[^./\\])\.[^./\\]*$"  # of a view's name; the name of a hidden file is no ending
 _LONGEST = 120  # bytes of a picture's name

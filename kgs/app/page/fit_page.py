@@ -93,7 +93,7 @@ def write_fit_page(
             gaussians,
             background=_ground(photographed, scene.background),
             options=fit.options,
-            weights=lambda: contributions(fit.model, scene.train, fit.options.near_plane),
+            weights=lambda: contributions(fit.model, scene.train, fit.options, fit.backend),
             offset=scene.offset,
         ),
         photos=replace(

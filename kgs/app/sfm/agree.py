@@ -91,8 +91,10 @@ def agreed_cameras(
     say_left_out(left_out, say)
     longest = max(photos[0].size)
     forward = is_forward(geometries)
-    cameras, degrees = judge(folder, solutions, list(kept.values()), longest, pairs, forward=forward)
-    return Agreed(cameras, SOLVERS[solutions.index(cameras)], degrees, held, pairs, left_out)
+    which, degrees = judge(folder, solutions, list(kept.values()), longest, pairs, forward=forward)
+    cameras = solutions[which]
+    assert cameras is not None  # it passed
+    return Agreed(cameras, SOLVERS[which], degrees, held, pairs, left_out)
 
 
 def say_left_out(left_out: Mapping[str, str], say: Callable[[str], None]) -> None:

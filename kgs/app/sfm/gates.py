@@ -100,10 +100,12 @@ def judge(
     pairs: Pairs,
     *,
     forward: bool = False,
-) -> tuple[Cameras, float]:
-    """The cameras that pass the gates, and the solvers' largest difference in degrees; a DataError if none pass.
+) -> tuple[int, float]:
+    """The index of the cameras that pass the gates, and the solvers' largest difference in degrees.
 
-    If both pass, those whose worst photo sees more points are taken.
+    A DataError if none pass.
+
+    If both pass, it is that of those whose worst photo sees more points.
 
     Args:
         folder: of the photos, which errors name.
@@ -114,7 +116,7 @@ def judge(
         forward: whether the camera moved along its view, which is what a refusal then speaks of.
     """
     reasons = [objections(cameras, names, longest) for cameras in solutions]
-    good = [cameras for cameras, against in zip(solutions, reasons, strict=True) if cameras and not against]
+    good = {i: cameras for i, cameras in enumerate(solutions) if cameras and not reasons[i]}
     if not good:
         raise DataError(folder, "", refusal(reasons[0], names, pairs, forward, _missing(solutions[0], names)))
     for cameras in solutions:  # nothing confirms a photo that only one solver placed
@@ -127,13 +129,13 @@ def judge(
     degrees, pair = disagreement(*both)
     if degrees > MOST_DEGREES:
         reason = (
-            f"two solvers are {degrees:.3g} degrees apart for {' and '.join(pair)}, at most {MOST_DEGREES:g} are right"
+            f"two solvers differ by {degrees:.3g} degrees about {' and '.join(pair)}; expected at most {MOST_DEGREES:g}"
         )
         raise DataError(folder, "", refusal([reason], names, pairs, forward))
     if doubt := focal_difference(both):
         raise DataError(folder, "", focal_refusal(doubt, names, pairs, forward))
-    sure = [cameras for cameras in good if cameras.focal_rise >= LEAST_RISE] or good
-    return max(sure, key=lambda cameras: min(cameras.points.values())), degrees
+    sure = {i: cameras for i, cameras in good.items() if cameras.focal_rise >= LEAST_RISE} or good
+    return max(sure, key=lambda i: min(sure[i].points.values())), degrees
 
 
 def groups_of(names: Sequence[str], pairs: Pairs) -> list[list[str]]:

@@ -77,7 +77,7 @@ def take_frames(video: Path, folder: Path, count: int | None, stage: Stage, say:
         for index in stage(indices, "frames", "frame"):
             pixels = reader.read(index)
             if pixels is None:
-                raise DataError(video, "", f"frame {index} could be decoded once, and now cannot")
+                raise DataError(video, "", f"frame {index} cannot be read a second time")
             paths.append(folder / f"frame_{index:05d}.png")
             write_png(paths[-1], torch.from_numpy(pixels[..., ::-1].copy()).permute(2, 0, 1) / 255)
     say(f"{video.name}: {len(paths)} frames, {way / (len(paths) - 1):.0f} degrees apart in the mean")
@@ -102,19 +102,19 @@ def _look(video: Path, stage: Stage) -> list[_Frame]:
 
 
 def _sharpest(frames: list[_Frame], count: int) -> list[int]:
-    """The indices of so many frames: of each stretch of the way the sharpest in its middle half."""
+    """The indices of so many frames, at most all: of each stretch of the way the sharpest in its middle half."""
     ways = np.array([frame.way for frame in frames])
     sharp = np.array([frame.sharpness for frame in frames])
-    targets = np.linspace(0, ways[-1], count)
+    count = min(count, len(frames))
     reach = ways[-1] / (count - 1) / 4
     chosen = list[int]()
-    for target in targets:
-        near = np.flatnonzero(np.abs(ways - target) <= reach)
-        near = near if len(near) else np.array([np.abs(ways - target).argmin()])
-        best = int(near[sharp[near].argmax()])
-        if not chosen or frames[best].number > chosen[-1]:
-            chosen.append(frames[best].number)
-    return chosen
+    for k, target in enumerate(np.linspace(0, ways[-1], count)):
+        first = chosen[-1] + 1 if chosen else 0
+        free = np.arange(first, len(frames) - (count - 1 - k))  # the others still find a place behind it
+        distances = np.abs(ways[free] - target)
+        near = free[distances <= max(reach, distances.min())]
+        chosen.append(int(near[sharp[near].argmax()]))
+    return [frames[index].number for index in chosen]
 
 
 class _Motion:
@@ -160,7 +160,11 @@ class _Reader:
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # else FFmpeg writes of damage to stderr
         self._capture = cv2.VideoCapture(str(video))
         self._next = 0
-        self.count = max(0, int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)))
+        self.count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        if self.count <= 0:  # the header of a recorder that writes as it goes has none
+            self.count = sum(1 for _ in iter(self._capture.grab, False))
+            self._capture.release()
+            self._capture = cv2.VideoCapture(str(video))
 
     def __enter__(self) -> Self:
         return self

@@ -93,7 +93,7 @@ def level_and_scale(cameras: Cameras) -> None:
     names = list(cameras.rotations)
     first = cameras.rotations[names[0]]
     up = -sum(rotation[1] for rotation in cameras.rotations.values())
-    turned = _onto(first @ up, np.array([0.0, -1.0, 0.0])) @ first
+    turned = leveling(first @ up) @ first
     depths = np.concatenate([_depths(scene, image) for image in scene.images.values()])
     scale = 1.0 / float(np.median(depths))
     center = np.mean([cameras.centers[name] for name in names], axis=0)
@@ -125,12 +125,19 @@ def _depths(scene: Any, image: Any) -> NDArray[np.float64]:
     return np.asarray(np.array(points).reshape(-1, 3) @ pose[2, :3] + pose[2, 3])
 
 
-def _onto(vector: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The smallest rotation of a vector onto a unit vector; the identity if the vector is opposite to it, or 0."""
-    length = float(np.linalg.norm(vector))
-    cosine = float(vector @ target) / length if length else -1.0
-    if cosine < -0.99:
+def leveling(up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The smallest rotation that turns a vector to -y; the identity if the vector is 0.
+
+    One that points to +y is first turned by half a turn about z, the view of an upside-down camera.
+    """
+    length = float(np.linalg.norm(up))
+    if not length:
         return np.eye(3)
-    x, y, z = np.cross(vector / length, target)
+    target = np.array([0.0, -1.0, 0.0])
+    cosine = float(up @ target) / length
+    if cosine < -0.99:
+        half = np.diag([-1.0, -1.0, 1.0])
+        return np.asarray(leveling(half @ up) @ half)
+    x, y, z = np.cross(up / length, target)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.asarray(np.eye(3) + cross + cross @ cross / (1 + cosine))
