@@ -1,6 +1,5 @@
 """The public surface: what there is, and what it is called."""
 
-import configparser
 import dataclasses
 import importlib
 import importlib.util
@@ -66,12 +65,6 @@ assert pickle.loads(pickle.dumps(kgs.GaussianRenderer)) is kgs.GaussianRenderer
 
 def test_names_are_loaded_when_they_are_asked_for():
     subprocess.run([sys.executable, "-c", LAZY], cwd=ROOT, check=True)
-
-
-def test_the_version_is_the_one_that_is_installed():
-    config = configparser.ConfigParser()
-    config.read(ROOT / "setup.cfg", encoding="utf-8")
-    assert kgs.__version__ == config["metadata"]["version"]
 
 
 # name -> its first parameters in order, with their defaults. What README and notebooks rely on

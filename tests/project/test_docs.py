@@ -16,6 +16,7 @@ import pytest
 import torch
 from tiny_scenes import narrow_lpips
 
+import kgs
 from kgs.fit.config import DETAILS, DROP, PRESETS, FitConfig
 from kgs.fit.plan import with_pace
 from kgs.init_points.dense import FEWEST, MOST, MOST_OF_FEW_VIEWS, PIXELS_OF_A_POINT
@@ -271,7 +272,7 @@ def test_the_citation_is_of_this_version():
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     assert citation["cff-version"] == "1.2.0"
     assert citation["type"] == "software"
-    assert citation["version"] == config["metadata"]["version"]
+    assert citation["version"] == config["metadata"]["version"] == kgs.__version__
     assert citation["license"] == config["metadata"]["license"]
     assert {"message", "title", "authors", "abstract"} <= set(citation)
     assert all({"type", "title", "authors"} <= set(reference) for reference in citation["references"])

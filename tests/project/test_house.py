@@ -123,9 +123,8 @@ def test_drop_imports_only_torch_and_the_reference_nothing_of_the_fast_path():
     assert imported_modules("kgs.reference") <= {"kgs.types"}
 
 
-@pytest.fixture(scope="module")
-def imported():
-    """What one process finds after importing more and more, four lines. Torch itself imports tqdm where that is."""
+def test_what_is_imported_is_light():
+    """What one process finds after importing more and more. Torch itself imports tqdm where that is."""
     code = """
 import sys
 import kgs, kgs.app.cli.run, kgs.fit.config
@@ -143,28 +142,15 @@ Path.exists = lambda path: False if str(path).startswith("/proc") else exists(pa
 print(kgs.machine.peak_rss_mb())
 """
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    return done.stdout.splitlines()
-
-
-def test_the_package_the_command_and_the_numbers_of_a_fit_are_read_without_heavy_libraries(imported):
-    assert imported[0] == "heavy:"
-
-
-def test_no_module_of_one_system_alone(imported):
-    """Windows has no `resource`: a fit can still be imported, and its memory is not known where nothing tells it."""
-    assert imported[3] == "0"
-
-
-def test_a_fit_of_photos_does_not_wait_for_packages_that_it_does_not_call(imported):
-    assert imported[2] == "slow:"
-
-
-def test_the_renderer_is_light(imported):
-    new = imported[1].split()
+    at_first, by_the_renderer, by_a_fit, memory = done.stdout.splitlines()
+    assert at_first == "heavy:"  # the package, the command and the numbers of a fit
+    new = by_the_renderer.split()
     others = {"losses", "datasets", "metrics", "init_points", "fit", "bench", "app", "study", "reference"}
     above = [f"kgs.{name}" for name in others]
     assert "kgs.renderer" in new
     assert [name for name in new if within(name, *HEAVY, *above)] == []
+    assert by_a_fit == "slow:"  # of photos: packages that it does not call
+    assert memory == "0"  # Windows has no `resource`: the memory of a fit is not known where nothing tells it
 
 
 # -- names and docstrings ------------------------------------------------------------------------------------------
