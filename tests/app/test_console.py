@@ -23,35 +23,21 @@ def test_without_a_terminal_a_line_every_tenth(capsys, total, done, told):
     assert lines == [f"depth maps: {count} of {total} views, fine" for count in told]
 
 
-@pytest.fixture
-def clock(monkeypatch):
-    """A clock that stands still until it is moved."""
-    now = [100.0]
-    monkeypatch.setattr("kgs.app.console.time.monotonic", lambda: now[0])
-
-    def move(seconds):
-        now[0] += seconds
-
-    return move
-
-
-def test_lines_tell_the_time_that_is_left_from_the_second_second_on(capsys, clock):
-    with progress(1000, "fit", done=500) as advance:
-        for _ in range(3):
-            clock(0.9)
+@pytest.mark.parametrize(
+    ("total", "done", "seconds", "told"),
+    [
+        (1000, 500, [0.9] * 3, ["503 of 1000 steps, 7.5 minutes left"]),  # 0.9 s for each of 497
+        (10, 0, [3.0] * 10, [*(f"{i} of 10 steps, {30 - 3 * i} s left" for i in range(1, 10)), "10 of 10 steps"]),
+    ],
+)
+def test_lines_tell_the_time_that_is_left_from_the_second_second_on(capsys, monkeypatch, total, done, seconds, told):
+    now = 100.0
+    monkeypatch.setattr("kgs.app.console.time.monotonic", lambda: now)
+    with progress(total, "fit", done=done) as advance:
+        for each in seconds:
+            now += each
             advance("fine")
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line == "fit: 503 of 1000 steps, 7.5 minutes left, fine"  # 0.9 s for each of 497
-
-
-def test_seconds_that_are_left_and_none_at_the_end(capsys, clock):
-    with progress(10, "film", unit="frame") as advance:
-        for _ in range(10):
-            clock(3.0)
-            advance()
-    lines = capsys.readouterr().err.splitlines()
-    assert lines[0] == "film: 1 of 10 frames, 27 s left"
-    assert lines[-1] == "film: 10 of 10 frames"
+    assert capsys.readouterr().err.splitlines() == [f"fit: {line}, fine" for line in told]
 
 
 def test_on_a_terminal_a_bar_with_the_name(monkeypatch):

@@ -258,26 +258,15 @@ def test_a_film_does_not_flash_where_it_passes_through_gaussians(tmp_path: Path,
     assert film.path_near_plane(gaussians.means, views.cameras, 3.0) == 3.0
 
 
-def boxes(content: bytes) -> list[tuple[bytes, bytes]]:
-    """The kinds and contents of the boxes of ISO/IEC 14496-12, one after the other."""
-    found = []
-    while content:
-        length = int.from_bytes(content[:4], "big")
-        found.append((content[4:8], content[8:length]))
-        content = content[length:]
-    return found
-
-
 def test_a_phone_plays_the_mp4(tmp_path: Path, monkeypatch: Any) -> None:
-    """Main profile, 4:2:0, eight bits, the index in front; read by the standard's boxes, not by FFmpeg."""
+    """Main profile, 4:2:0, eight bits, the index in front; as the bytes of ISO/IEC 14496-12, not by FFmpeg."""
     pytest.importorskip("av")
     monkeypatch.setenv(encoders.ASKED, "libx264")
     frame = np.zeros((48, 96, 3), np.uint8)
     assert encoders.encode(tmp_path / "a.mp4", [frame] * 30, (96, 48)) == ""
     content = (tmp_path / "a.mp4").read_bytes()
-    kinds = [kind for kind, _ in boxes(content)]
-    assert kinds[0] == b"ftyp"
-    assert kinds.index(b"moov") < kinds.index(b"mdat")
+    assert content[4:8] == b"ftyp"
+    assert content.index(b"moov") < content.index(b"mdat")
     configuration = content[content.index(b"avcC") + 4 :]
     assert configuration[1] in (66, 77)  # baseline, main (ISO/IEC 14496-15)
     assert configuration[3] <= 31  # level 3.1: 1280x720 at 30 frames per second
