@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from PIL import ImageCms
 
 _SRGB = ImageCms.createProfile("sRGB")
-_SAME = 3  # levels of 255: profiles that move no colour farther are other writings of sRGB
+_SAME = 3  # levels of 255: a profile that changes no colour by more than this is sRGB under another name
 _PROBE = np.stack(np.meshgrid(*[np.linspace(0, 255, 9).round()] * 3, indexing="ij"), axis=-1).astype(np.uint8)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kgs.errors import DataError
+from kgs.errors import DataError, listed
 
 from .border import border_transmittance
 from .folders import CAMERAS_REPORT
@@ -109,9 +109,8 @@ def load_scene(
         if not bool((cloud.points.abs() <= LARGEST).all()):
             raise DataError(root, "points", f"expected positions up to {LARGEST:g}, got others")
         if missing := [frame.path for frame in (*train, *test) if not frame.path.is_file()]:
-            listed = ", ".join(str(path.relative_to(root)) for path in missing[:_LISTED])
-            listed += f" and {len(missing) - _LISTED} more" if missing[_LISTED:] else ""
-            raise DataError(root, "", f"{len(missing)} of {len(train) + len(test)} images are missing: {listed}")
+            names = listed([path.relative_to(root) for path in missing], _LISTED)
+            raise DataError(root, "", f"{len(missing)} of {len(train) + len(test)} images are missing: {names}")
         color = torch.tensor(BACKGROUNDS[background], dtype=torch.float32)
         offset = torch.stack([frame.pose[:3, 3] for frame in train]).mean(dim=0)  # float64; without the test views
         first = _usual(train)

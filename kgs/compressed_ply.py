@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -72,7 +73,7 @@ def save_compressed_ply(path: str | os.PathLike[str], model: GaussianModel, offs
     low_means, high_means, means = _code_in_chunks(values["means"], _BITS_OF_VECTOR)
     low_scales, high_scales, scales = _code_in_chunks(_finite_scales(values["log_scales"]), _BITS_OF_VECTOR)
     low_colors, high_colors, colors = _code_in_chunks(values["sh_dc"][:, 0] * SH_C0 + 0.5, (8, 8, 8))
-    opacities = _code(_sigmoid(values["opacity_logits"]), 0.0, 1.0, 8)
+    opacities = _code(torch.from_numpy(values["opacity_logits"]).sigmoid().numpy(), 0.0, 1.0, 8)
     chunks = np.hstack([low_means, high_means, low_scales, high_scales, low_colors, high_colors])
     rows = [
         _pack(means, _BITS_OF_VECTOR),
@@ -201,9 +202,3 @@ def _code_harmonics(sh_rest: NDArray[np.float64]) -> NDArray[np.uint8]:
     phases = np.arange(3 * bands) * _GOLDEN % 1.0
     codes = np.diff(np.floor(np.cumsum(exact, axis=0) + phases), axis=0, prepend=0.0)
     return np.clip(codes, 0.0, 255.0).astype(np.uint8)  # a rounding error of the sum may add one
-
-
-def _sigmoid(logits: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The opacities of logits, without overflow."""
-    opacities: NDArray[np.float64] = np.exp(-np.logaddexp(0.0, -logits))
-    return opacities

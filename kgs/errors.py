@@ -3,18 +3,16 @@
 from collections.abc import Sequence
 from os import PathLike
 
-_LISTED = 3  # names in a message
-
 
 def printable(text: object) -> str:
     """Text as one line of a message: control characters, as file names may have, are escaped."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
 
 
-def listed(names: Sequence[object]) -> str:
+def listed(names: Sequence[object], most: int = 3) -> str:
     """The first names of several, printable, and how many more there are."""
-    more = len(names) - _LISTED
-    text = ", ".join(printable(name) for name in names[:_LISTED])
+    more = len(names) - most
+    text = ", ".join(printable(name) for name in names[:most])
     return f"{text} and {more} more" if more > 0 else text
 
 

@@ -13,7 +13,7 @@ from kgs.datasets.folders import find_models, image_folder
 from kgs.datasets.frames import Frame, FrameSet, PointCloud, find_file
 from kgs.datasets.image_file import ImageFile
 from kgs.datasets.images import Intrinsics
-from kgs.errors import DataError
+from kgs.errors import DataError, listed
 
 from .colmap_model import ColmapCamera, ColmapImage, model_file, read_cameras, read_images, read_points
 
@@ -47,7 +47,7 @@ def load_colmap(root: Path, photo_folder: str = "") -> FrameSet:
         ids[path] = image_id
     gone = [frame.name for frame in frames if not frame.path.is_file()]
     if 0 < len(gone) <= len(frames) / 2:
-        notes += (f"{len(gone)} of {len(frames)} photos are gone and left out: {', '.join(gone[:_LISTED])}",)
+        notes += (f"{len(gone)} of {len(frames)} photos are gone and left out: {listed(gone, _LISTED)}",)
         frames = [frame for frame in frames if frame.path.is_file()]
     return FrameSet(frames, model_points=lambda t: track_points(folder, {ids[f.path] for f in t}), notes=notes)
 
@@ -59,9 +59,9 @@ def largest_model(root: Path) -> tuple[Path, tuple[str, ...]]:
         return folders[0], ()
     counts = {folder: _image_count(folder) for folder in folders}
     largest = max(folders, key=counts.__getitem__)
-    listed = [f"{folder.relative_to(root)} has {counts[folder]}" for folder in folders if folder != largest]
+    others = [f"{folder.relative_to(root)} has {counts[folder]}" for folder in folders if folder != largest]
     name = largest.relative_to(root)
-    note = f"{name} is the COLMAP model that is read, with {counts[largest]} images: {', '.join(listed[:_LISTED])}"
+    note = f"{name} is the COLMAP model that is read, with {counts[largest]} images: {', '.join(others[:_LISTED])}"
     return largest, (note,)
 
 

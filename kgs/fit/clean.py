@@ -39,7 +39,7 @@ NEAR = 0.3  # distance to a camera, over the 1st percentile of depths
 ISOLATED = 10.0  # distance to the nearest three, over what is typical there
 APART = 3.0  # the same, over its own largest axis
 _SIGNS = 8  # images of random signs for each view
-_PARTS = 200  # the removed are as many as possible, to this part of the candidates
+_PARTS = 200  # the search for the number to remove ends at a 200th of the candidates
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,7 @@ LEAST_RATIO = 1.3  # between the gains of two photos in a channel, for gains to 
 MOST_LEFT = 0.6  # of the median difference of a patch's colours, after the gains, for gains to be used
 USABLE = 0.03, 0.97  # colours beyond are black or saturated
 ROUNDS = 8  # of the weights
-PRIOR = 1e-3  # patches that speak for a gain of 1: where no other does
+PRIOR = 1e-3  # so many imaginary patches have gain 1: they decide where no real one does
 
 
 def decide_exposure(plan: Plan, points: InitialPoints) -> Plan:

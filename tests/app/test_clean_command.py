@@ -117,7 +117,7 @@ def strays_alone(path):
         ("{splat} --device foo", "--device: expected"),
         ("{scene}/transforms_train.json", "not a PLY file"),
         ("{splat} -o {out}", "--out: expected a file that ends in .ply"),
-        ("{splat} -o {fit}/splat.ply", "choose another file"),
+        ("{splat} -o {fit}/splat.ply", "--out: expected another file"),
         ("{splat} -o {fit}/none/splat.ply", "expected a file in a folder that is there"),
     ],
 )

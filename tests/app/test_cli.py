@@ -19,10 +19,9 @@ from tiny_scenes import write_colmap
 import kgs
 import kgs.app.cli.run
 from kgs.app import cli
-from kgs.app.cli.fit import defaults as defaults_of_fit
 from kgs.app.files.outputs import FILMS
 from kgs.app.files.results_folder import RESULTS
-from kgs.fit.config import DETAILS, DROP, PAPER, PRESETS, FitConfig
+from kgs.fit.config import DETAILS, DROP, PAPER, FitConfig
 
 STEPS = 30
 FIT = ("--init", "scene", "--max-gaussians", 3000)
@@ -49,7 +48,8 @@ def test_a_fit_of_fewer_pixels_than_the_photos_have_names_detail_high(folder, tm
     """Where --detail chose them; --size was a choice of the user."""
     monkeypatch.setitem(DETAILS, "low", DETAILS["low"]._replace(size=32))
     quick = ("--steps", 2, "--evaluations", 1, *FIT)
-    for options, expected in ((("--detail", "low"), True), (("--size", 32), False), ((), False)):
+    paper = ("--preset", "paper", "--detail", "low")
+    for options, expected in ((("--detail", "low"), True), (paper, False), (("--size", 32), False), ((), False)):
         assert run("fit", folder, "-o", tmp_path / "out", *options, *quick) == 0
         line = "the same command with --detail high fits 40 pixels instead of 32"
         assert (line in capsys.readouterr().out) == expected, options
@@ -280,12 +280,6 @@ def test_help_without_a_command(words, capsys):
     assert "usage: kgs" in said
     assert "speed" in said
     assert ("demo" in said) == ("bench" not in words)
-
-
-@pytest.mark.parametrize("detail", ["low", "normal", "high"])
-def test_a_published_recipe_stays_so_with_any_detail(detail):
-    assert defaults_of_fit(["a", "--preset", "paper", "--detail", detail])["config"] == PRESETS["paper"]
-    assert defaults_of_fit(["a", f"--detail={detail}"])["config"] == replace(FitConfig(), **DETAILS[detail].entries)
 
 
 def test_a_mistake_in_kgs_is_no_mistake_of_the_user(folder, tmp_path, capsys, monkeypatch):

@@ -17,10 +17,10 @@ from .options import Existing, Out
 
 
 def defaults(words: list[str]) -> dict[str, Any]:
-    """The default of `config`, which follows from --preset and, for the preset auto, from --detail."""
+    """The default of `config`, which follows from --preset and --detail."""
     preset = PRESETS.get(_value(words, "--preset"), PRESETS["auto"])
     detail = DETAILS.get(_value(words, "--detail"), DETAILS["normal"])
-    return {"config": replace(preset, **detail.entries) if preset is PRESETS["auto"] else preset}
+    return {"config": replace(preset, **detail.entries)}
 
 
 def _value(words: list[str], option: str) -> str:
@@ -77,8 +77,8 @@ def fit(
         mask_means: what black in a mask means. away: look away, somebody walked by. absent: nothing is there.
         preset: auto: what the training views need. paper: DropGaussian's rule and recipe, as published. plain: the same
             without dropping. See --preset paper --help-all.
-        detail: sets size, steps and initial points together; with --preset paper or plain the size alone. low: 378
-            pixels. high: 1000 pixels. Options given by name win. See --detail high --help-all.
+        detail: sets size, steps and initial points together. low: 378 pixels. high: 1000 pixels. Options given by name
+            win. See --detail high --help-all.
         resume: continue from the checkpoint in the folder of the results.
         title: of the page. Unless given: the name of the folder.
         photos: --no-photos leaves the photos out of the page.

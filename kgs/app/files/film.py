@@ -1,10 +1,9 @@
 """A film of a splat: a smooth path through the training cameras at one speed, as a file that browsers play."""
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -15,7 +14,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from kgs.datasets.scene import Views, pinholes
-from kgs.geometry import meeting_point, typical_depths
+from kgs.geometry import camera_centers, meeting_point, typical_depths
+from kgs.progress import Stage, silent
 
 from .cameras import upright
 from .encoders import encode
@@ -37,7 +37,7 @@ def write_film(
     render: Callable[[PinholeCamera], Tensor],
     views: Views,
     depth: float,
-    stage: Callable[[Sequence[Any], str, str], Iterable[Any]] = lambda items, *_: items,
+    stage: Stage = silent,
 ) -> str:
     """Write a film along the :func:`tour` through some views, as MP4 or WebM by the suffix. The write is atomic.
 
@@ -116,7 +116,7 @@ def paced(extrinsics: Tensor, frames: int, depth: float) -> Tensor:
     """
     even = np.linspace(0, 1, _PIECES + 1)
     path = torch.linalg.inv(tour(extrinsics, even, depth))
-    centers = torch.linalg.inv(extrinsics.double().cpu())[:, :3, 3]
+    centers = camera_centers(extrinsics)
     unit = float(torch.cdist(centers, centers).max()) or depth
     places = torch.cat([path[:, :3, 3] / unit, path[:, :3, 2] / torch.pi], 1).numpy()
     done = np.append(0, np.linalg.norm(np.diff(places, axis=0), axis=1).cumsum())

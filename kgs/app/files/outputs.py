@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kgs.datasets.folders import CAMERAS_REPORT, list_images
+from kgs.datasets.folders import CAMERAS_REPORT, LAYOUT_FILES, list_images
 from kgs.errors import DataError
 from kgs.json_files import write_whole
 
@@ -22,7 +22,7 @@ FILMS = ("turntable.mp4", "turntable.webm")  # a fit writes one of them
 # for other programs, and for messengers
 EXPORTS = ("cameras.json", "splat.compressed.ply", "splat.glb", "preview.jpg", *FILMS)
 NOT_OWN = "was not written by kgs, or was changed since (it knows its files by size and time: copy folders with cp -a)"
-_SCENES = ("poses_bounds.npy", "sparse", "transforms.json", "transforms_train.json")
+_SCENES = ("sparse", *LAYOUT_FILES.values())
 _ENDING = r"(?<=[^./\\])\.[^./\\]*$"  # of a view's name; the name of a hidden file is no ending
 _LONGEST = 120  # bytes of a picture's name
 

@@ -189,9 +189,9 @@ def _widened(low: float, high: float) -> list[float]:
 def _tour(cameras: PinholeCamera, means: Tensor) -> dict[str, Any]:
     """The path of the film through some cameras: `FRAMES` rotations and positions at equal times, and seconds."""
     depth = typical_depths(means, cameras)[1]
-    poses = paced(cameras.extrinsics, FRAMES, depth).numpy()
-    rotations = poses[:, :3, :3]
-    positions = -np.einsum("fji,fj->fi", rotations, poses[:, :3, 3])
+    poses = paced(cameras.extrinsics, FRAMES, depth)
+    rotations = poses[:, :3, :3].numpy()
+    positions = camera_centers(poses).numpy()
     digits = _DIGITS - math.floor(math.log10(depth))
     rows = zip(rotations.round(_DIGITS).tolist(), positions.round(digits).tolist(), strict=True)
     return {

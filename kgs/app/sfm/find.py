@@ -4,7 +4,7 @@ from pathlib import Path
 
 from kgs.datasets import folders
 from kgs.datasets.folders import HEIC_SUFFIXES, IMAGE_SUFFIXES, UNREADABLE_SUFFIXES, VIDEO_SUFFIXES, list_images
-from kgs.errors import DataError
+from kgs.errors import DataError, listed
 
 FEWEST = 3
 _LISTED = 10
@@ -28,25 +28,25 @@ def find_photos(folder: Path) -> list[Path]:
         raise DataError(folder, "", "expected a folder of photos, found no such folder")
     paths = list_photos(folder)
     if lost := [path for path in list_images(folder, _readable()) if not path.exists()]:
-        raise DataError(folder, "", f"expected photos, got links to files that are not there: {listed(lost)}")
+        raise DataError(folder, "", f"expected photos, got links to files that are not there: {listed_files(lost)}")
     files = [path for path in sorted(folder.iterdir()) if path.is_file() and not path.name.startswith(".")]
     videos = [path for path in files if _is_video(path)]
     unreadable = set(UNREADABLE_SUFFIXES).difference(_readable())
     converted = _converted(folder)
     if others := [path for path in files if path.suffix.lower() in unreadable and path not in converted]:
-        wrong = f"{len(others)} of {len(others) + len(paths)} photos cannot be read ({listed(others)}). "
+        wrong = f"{len(others)} of {len(others) + len(paths)} photos cannot be read ({listed_files(others)}). "
         raise DataError(folder, "", wrong + CONVERT)
     if not paths and videos:
-        raise DataError(folder, "", f"holds no photos but several videos ({listed(videos)}): name one of them")
+        raise DataError(folder, "", f"holds no photos but several videos ({listed_files(videos)}): name one of them")
     if not paths:
         deeper = [path for path in sorted(folder.iterdir()) if path.is_dir() and _holds_photos(path)]
         if deeper:
-            reason = f"holds no photos itself, but these folders in it do: {listed(deeper)}. Name one of them"
+            reason = f"holds no photos itself, but these folders in it do: {listed_files(deeper)}. Name one of them"
         else:
             reason = f"expected photos ({' '.join(IMAGE_SUFFIXES)}), found none. {ADVICE}"
         raise DataError(folder, "", ". ".join([reason, *folders.unused_files(folder)]))
     if len(paths) < FEWEST:
-        reason = f"expected at least {FEWEST} photos, found {len(paths)} ({listed(paths)}). {ADVICE}"
+        reason = f"expected at least {FEWEST} photos, found {len(paths)} ({listed_files(paths)}). {ADVICE}"
         raise DataError(folder, "", reason)
     return paths
 
@@ -75,7 +75,7 @@ def notes_on(folder: Path) -> list[str]:
     """What a folder of photos holds that is not used, a sentence each."""
     notes = list(folders.unused_files(folder))
     if converted := sorted(_converted(folder)):
-        notes.append(f"{len(converted)} raw or HEIC files are not used, but their JPEGs: {listed(converted)}")
+        notes.append(f"{len(converted)} raw or HEIC files are not used, but their JPEGs: {listed_files(converted)}")
     return notes
 
 
@@ -89,10 +89,9 @@ def _readable() -> tuple[str, ...]:
     return IMAGE_SUFFIXES + (HEIC_SUFFIXES if folders.has_heic() else ())
 
 
-def listed(paths: list[Path]) -> str:
+def listed_files(paths: list[Path]) -> str:
     """The names of files, the first ten of them."""
-    names = ", ".join(path.name for path in paths[:_LISTED])
-    return names + (f" and {len(paths) - _LISTED} more" if paths[_LISTED:] else "")
+    return listed([path.name for path in paths], _LISTED)
 
 
 def _holds_photos(folder: Path) -> bool:

@@ -11,7 +11,7 @@ from itertools import combinations
 
 from kgs.errors import DataError
 
-from .find import FEWEST, listed
+from .find import FEWEST, listed_files
 from .gates import FEWEST_POINTS, MOST_DEGREES, MOST_RATIO, SAME_PLACE, Pairs, angle_between, gap, groups_of, matches_of
 from .map import Cameras, PairGeometry
 from .read import OpenPhoto, by_shape
@@ -64,7 +64,7 @@ def _of_unknown_lens(groups: Mapping[str, list[OpenPhoto]], usual: str) -> list[
 
 
 def _listed(groups: Mapping[str, list[OpenPhoto]]) -> str:
-    return "; ".join(f"{name}: {listed([photo.path for photo in group])}" for name, group in groups.items())
+    return "; ".join(f"{name}: {listed_files([photo.path for photo in group])}" for name, group in groups.items())
 
 
 def without_overlap(
