@@ -7,9 +7,8 @@ import os
 import re
 import shutil
 import signal
+import subprocess
 import sys
-import time
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -95,23 +94,13 @@ def test_a_second_fit_in_the_folder_is_refused(scene: Any, tmp_path: Path) -> No
 
 
 def test_a_killed_process_leaves_no_lock(tmp_path: Path) -> None:
-    if not hasattr(os, "fork"):
-        pytest.skip("processes as POSIX has them")
-    told, tell = os.pipe()
-    with warnings.catch_warnings(action="ignore"):  # there are threads
-        child = os.fork()
-    if child == 0:
-        with locked(tmp_path):
-            os.write(tell, b"locked")
-            time.sleep(600)
-        os._exit(1)
-    assert os.read(told, 6) == b"locked"
-    with pytest.raises(DataError, match="another fit"), locked(tmp_path):
-        pass
-    os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    for end in (told, tell):
-        os.close(end)
+    code = "import sys, time, pathlib, kgs.app.files.results_folder as folder\n"
+    code += "with folder.locked(pathlib.Path(sys.argv[1])):\n    print('locked', flush=True)\n    time.sleep(60)"
+    with subprocess.Popen([sys.executable, "-c", code, tmp_path], stdout=subprocess.PIPE) as process:
+        assert process.stdout.readline()
+        with pytest.raises(DataError, match="another fit"), locked(tmp_path):
+            pass
+        process.kill()
     with locked(tmp_path):
         pass
 
