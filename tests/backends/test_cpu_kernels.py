@@ -73,14 +73,8 @@ def test_pixels_are_the_lanes(kernel):
     f, i8 = nb.float32, nb.int64
     types = {"grid": nb.types.UniTuple(i8, 2), "offsets": i8[::1], "entries": nb.int32[::1], "table": f[:, ::1]}
     types |= {"threshold": f, "stop": f, "channels": nb.types.UniTuple(i8, 3)}
-    types |= {
-        "starts": f[:, ::1],
-        "reached": i8[::1],
-        "transmittance": f[:, :, ::1],
-        "depths": f[:, :, ::1],
-        "grad_transmittance": f[:, :, ::1],
-    }
-    types |= {"grads": f[:, :, :, ::1], "needs_absolute": nb.boolean}
+    types |= dict.fromkeys(("transmittance", "depths", "grad_transmittance"), f[:, :, ::1])
+    types |= {"starts": f[:, ::1], "reached": i8[::1], "grads": f[:, :, :, ::1], "needs_absolute": nb.boolean}
     types |= {"sums": f[:, :, :, ::1] if kernel is kernels.composite_forward else f[:, ::1]}
     names = kernel.py_func.__code__.co_varnames[: kernel.py_func.__code__.co_argcount]
     text = assembly(kernel, *(types.get(name, i8) for name in names))

@@ -12,12 +12,7 @@ from kgs.compiled.kernel import exp2, f32  # noqa: E402
 from kgs.compiled.lanes import WIDTH, load, store  # noqa: E402
 
 LIMIT = f32(0.5)
-ONES = {
-    "floor": np.floor,
-    "ceil": np.ceil,
-    "magnitude": np.abs,
-    "exp2": np.exp2,
-}
+ONES = {"floor": np.floor, "ceil": np.ceil, "magnitude": np.abs, "exp2": np.exp2}
 TWOS = {
     "add": (operator.add, np.add),
     "sub": (operator.sub, np.subtract),

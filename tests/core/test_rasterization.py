@@ -341,14 +341,6 @@ def test_a_covariance_that_is_not_finite_is_left_out_and_its_gradient_is_0(value
     assert covars.grad[rest].any()
 
 
-def test_covariances_are_read_from_their_upper_triangles():
-    gaussians, cameras = scene(dtype=torch.float32)
-    covars = covariances(gaussians)
-    whole, upper = (call(gaussians, cameras, covars=x, quats=None, scales=None)[0] for x in (covars, covars.triu()))
-    assert torch.allclose(whole, upper, atol=1e-5)
-    assert torch.allclose(whole, call(gaussians, cameras)[0], atol=1e-4)
-
-
 @pytest.mark.parametrize("packed", [True, False])
 def test_a_second_backward_pass_sets_the_same_absolute_gradients(packed):
     gaussians, cameras = scene(dtype=torch.float32)

@@ -166,8 +166,10 @@ def covariances(values):
 
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
-def test_covariances(mode):
-    compare(covariances(scene()), rasterize_mode=mode)
+@pytest.mark.parametrize("part", [torch.clone, torch.triu], ids=["whole", "upper triangle"])
+def test_covariances(part, mode):
+    values = covariances(scene())
+    compare(values | {"covars": part(values["covars"])}, rasterize_mode=mode)
 
 
 def needles(n, ratio):

@@ -2,14 +2,13 @@
 
 import pytest
 import torch
-from factories import pinhole, random_gaussians
+from factories import FIELDS, pinhole, random_gaussians
 from kornia.geometry.camera import PinholeCamera
 
 from kgs import GaussianRenderer, Gaussians
 
 pytestmark = pytest.mark.usefixtures("each_backend")
 
-FIELDS = ("means", "quats", "scales", "opacities", "colors")
 SHAPES = {"ball": (1.0, 1.0, 1.0), "needle": (1.0, 1e-12, 1e-12), "pancake": (1.0, 1.0, 1e-12)}
 
 
