@@ -185,6 +185,7 @@ def test_raycast_is_the_solution_of_each_pair_of_a_ray_and_a_triangle():
     rng = np.random.default_rng(0)
     intrinsics, size = _pinhole(120, 160)
     large = rng.normal(size=(6, 3, 3)) * [9.0, 9.0, 2.0] + [0.0, 0.0, 3.0]
+    large[5] = [[-1.0, 1.0, 4.0], [1.0, 1.0, 4.0], [0.1, 1.0, -2.0]]  # a floor, from before the camera to behind it
     small = rng.normal(size=(80, 1, 3)) * [2.0, 2.0, 0.5] + [0.0, 0.0, 4.0] + 0.2 * rng.normal(size=(80, 3, 3))
     triangles = np.concatenate([large[:3], small, large[3:], small[:20]])
     counts = _project(triangles, intrinsics, np.eye(4), size).counts

@@ -81,6 +81,21 @@ def test_smoothed_costs_are_torchs(height, width, planes):
     torch.testing.assert_close(smoothed, expected, rtol=1e-6, atol=2e-6, check_stride=False)
 
 
+@pytest.mark.parametrize("last_row", [[0.002, -0.003, 1.0], [-0.1, 0.0, 1.0]])
+def test_a_warped_ramp_is_a_ramp_and_empty_behind_the_camera(last_row):
+    """Bilinear interpolation does not change a + b x + c y, so the places can be read from the grey values."""
+    homography = torch.tensor([[1.1, 0.05, -2.3], [-0.04, 0.93, 1.7], last_row], dtype=torch.float64)
+    rows, columns = torch.meshgrid(torch.arange(20), torch.arange(30), indexing="ij")
+    ramp = 0.2 + 0.01 * columns + 0.02 * rows
+    x, y, z = torch.einsum("ij,jhw->ihw", homography, torch.stack([columns, rows, torch.ones_like(rows)]).double())
+    u, v = x / z, y / z
+    expected = (z > 0) & (u >= 0) & (u <= 29) & (v >= 0) & (v <= 19)
+    assert expected.any()
+    warped, inside = sweep_costs_module.warp(ramp, homography)
+    assert torch.equal(inside, expected)
+    torch.testing.assert_close(warped, (0.2 + 0.01 * u + 0.02 * v).where(expected, 0).float(), rtol=0, atol=1e-5)
+
+
 @pytest.mark.parametrize("count", [2, pytest.param(5, marks=pytest.mark.slow)])
 def test_depth_maps_are_torchs(count):
     views = synthetic_scene(train_views=count, test_views=1, size=(48, 64), seed=0).train
