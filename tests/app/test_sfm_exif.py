@@ -90,12 +90,10 @@ def test_nothing_and_damage_are_no_metadata(tmp_path):
         assert found.focal_over_width in (None, whole.focal_over_width)
 
 
-@pytest.mark.parametrize("value", [0, -3.0, float("nan"), float("inf"), "28", b"28", (), (0,), None, 10**400])
+@pytest.mark.parametrize("value", [0, -3.0, float("nan"), float("inf"), (), (0,), None, 10**400, "28", b"28"])
 def test_values_that_are_no_positive_number_count_as_missing(value):
-    found = Exif.of({0xA405: value, 0x0112: value})
-    assert found.orientation == 1
-    assert found.focal_35mm in (None, 28.0)
-    assert found.focal_ratio(4, 3) is None or found.focal_35mm == 28.0
+    focal = 28.0 if value in ("28", b"28") else None  # a number as text is one
+    assert Exif.of({0xA405: value, 0x0112: value}) == Exif(focal_35mm=focal)
 
 
 @pytest.mark.parametrize("kind", ["said", "seen"])

@@ -70,8 +70,7 @@ def test_a_frame_is_upright_as_the_header_says(tmp_path):
     one = 1 << 16
     turned = struct.pack(">9i", 0, one, 0, -one, 0, 0, SIZE[1] * one, 0, 1 << 30)
     video.write_bytes(data[:at] + turned + data[at + 36 :])
-    number, *_ = take(video, 3)
-    assert number >= 0
+    take(video, 3)
     first = cv2.imread(str(next(video.with_suffix("").iterdir())))
     assert first.shape[:2] == (SIZE[0], SIZE[1])  # 240 wide, 320 high
 
