@@ -17,6 +17,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import convert_points_from_homogeneous
 from kornia.geometry.vector import Vector3
@@ -28,7 +29,7 @@ from kornia.sensors.camera.projection_model import OrthographicProjection
 from numpy.polynomial import Polynomial
 from torch import Tensor
 
-from .types import check_intrinsics, check_tensor
+from .types import check_intrinsic_rows, check_intrinsics, check_tensor
 
 MARGIN = 0.15
 Pixels = Callable[[Tensor], Tensor]
@@ -194,9 +195,11 @@ def _versions(cameras: PinholeCamera) -> list[tuple[int, int]] | None:
 
 
 def _pinhole_size(cameras: PinholeCamera) -> tuple[int, int]:
-    check_intrinsics("cameras", cameras.intrinsics)
-    pairs = torch.stack([cameras.height, cameras.width], 1).tolist()
-    return _one_size({(int(height), int(width)) for height, width in pairs})
+    matrices = cameras.intrinsics.detach().double()
+    last = F.pad(torch.stack([cameras.height, cameras.width], 1).to(matrices), (0, matrices.shape[-1] - 2))
+    rows = torch.cat([matrices, last[:, None]], 1).tolist()  # at once: a GPU waits each time
+    check_intrinsic_rows("cameras", [matrix[:-1] for matrix in rows])
+    return _one_size({(int(matrix[-1][0]), int(matrix[-1][1])) for matrix in rows})
 
 
 def _model_size(cameras: PosedCamera) -> tuple[int, int]:

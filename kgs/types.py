@@ -282,8 +282,13 @@ def check_intrinsics(name: str, matrices: Tensor) -> None:
     on a GPU it waits.
     """
     size = matrices.shape[-1]
-    last_rows = [[float(i == j) for j in range(size)] for i in range(2, size)]
-    for matrix in matrices.detach().reshape(-1, size, size).tolist():
+    check_intrinsic_rows(name, matrices.detach().reshape(-1, size, size).tolist())
+
+
+def check_intrinsic_rows(name: str, matrices: list[list[list[float]]]) -> None:
+    """The same of matrices whose values were read."""
+    for matrix in matrices:
+        last_rows = [[float(i == j) for j in range(len(matrix))] for i in range(2, len(matrix))]
         if matrix[2:] != last_rows or any(value != 0.0 for row in matrix[:2] for value in row[3:]):
             why = "to resize the images, scale the first two rows alone: K[:2] /= factor"
             raise ValueError(f"{name}: expected intrinsics with (0, 0, 1) as third row, got {matrix}; {why}")
