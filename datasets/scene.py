@@ -115,10 +115,15 @@ class Views:
 
         TypeError for positions that are not integers, IndexError for views that do not exist.
         """
-        rows = torch.as_tensor(index, device=self.cameras.extrinsics.device)
+        rows = index if isinstance(index, Tensor) else torch.as_tensor(index, device="cpu")
         if rows.numel() and (rows.is_floating_point() or rows.is_complex() or rows.dtype == torch.bool):
             raise TypeError(f"index: expected integers, got {rows.dtype}")
         rows = rows.reshape(-1).long()
+        if not bool(((rows >= -len(self)) & (rows < len(self))).all()):
+            raise IndexError(
+                f"index: expected whole numbers below {len(self)}, the number of views, got {rows.tolist()}"
+            )
+        rows = rows.to(self.cameras.extrinsics.device)
         cameras = self.cameras
         return PinholeCamera(
             cameras.intrinsics[rows], cameras.extrinsics[rows], cameras.height[rows], cameras.width[rows]

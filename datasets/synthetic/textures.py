@@ -1,7 +1,7 @@
 """Random fields for procedural solid textures, band-limited so that a camera can resolve them.
 
-A texture is a function of the point alone, to the bit: a product of a matrix and a vector would round the last rows of
-a block differently. Detail comes from sums of cosine waves with random directions and phases,
+A texture is a function of the point alone, to the bit: products of matrices would round the last rows of a block, or a
+single row, differently. Detail comes from sums of cosine waves with random directions and phases,
 the spectral form of a stationary Gaussian field.
 """
 
@@ -30,7 +30,9 @@ def field(rng: np.random.Generator, shortest: float, longest: float) -> Texture:
         values = np.empty(len(points), dtype=np.float32)
         for start in range(0, len(points), BLOCK):
             rows = slice(start, start + BLOCK)
-            values[rows] = np.einsum("nk,k->n", np.cos(points[rows] @ waves + phases), amplitudes)
+            x, y, z = points[rows].T[..., None]
+            angles = x * waves[0] + y * waves[1] + z * waves[2] + phases
+            values[rows] = np.einsum("nk,k->n", np.cos(angles), amplitudes)
         return values
 
     return texture

@@ -87,5 +87,5 @@ class Adam:
             negative = any(bool((loaded[name] < 0).any()) for name in ("step", "exp_avg_sq"))
             if negative or {name: tuple(value.shape) for name, value in loaded.items()} != shapes:
                 raise ValueError(f"optimizer: expected a step and two moments like {group['name']}, got others")
-            moments = {name: loaded[name].to(parameter) for name in ("exp_avg", "exp_avg_sq")}
-            self.state[parameter] = {"step": loaded["step"].to(parameter.device, torch.float32), **moments}
+            moments = {name: loaded[name].to(parameter, copy=True) for name in ("exp_avg", "exp_avg_sq")}
+            self.state[parameter] = {"step": loaded["step"].to(parameter.device, torch.float32, copy=True), **moments}
