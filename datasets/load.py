@@ -125,11 +125,11 @@ def load_scene(
         at_size = train_per_scale[0]
         (test_views,) = make_views(test, scales[:1])
         notes = (*frame_set.notes, *_mask_notes([*train, *test], at_size, absent))
-        if at_size.light is not None:
+        if at_size.transmittance is not None:
             notes += (_BORDER,)
         return Scene(
             train=at_size,
-            test=replace(test_views, light=at_size.light),
+            test=replace(test_views, transmittance=at_size.transmittance),
             points=(cloud.points - offset).float(),
             point_colors=cloud.colors.float(),
             init_kind=cloud.kind,
@@ -167,7 +167,7 @@ def _with_border(train: Views) -> Views:
     has_pixels = train.images.device.type != "meta"
     if not has_pixels or train.masks is not None:
         return train
-    return replace(train, light=border_transmittance(train.images))
+    return replace(train, transmittance=border_transmittance(train.images))
 
 
 def _split(

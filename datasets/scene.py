@@ -33,8 +33,8 @@ class Views:
             that was loaded with `photos=False`.
         names: file names, unique, in the order of the images.
         masks: `(V, 1, H, W)` in [0, 1], the images' alpha channel, or None.
-        light: `(H, W)` in [0, 1], the transmittance of each pixel, the same in all images, or None: 1 everywhere. It is
-            below 1 in the dark border that removing a lens's distortion can leave.
+        transmittance: `(H, W)` in [0, 1], the share of light that each pixel lets through, the same in all images, or
+            None: 1 everywhere. It is below 1 in the dark border that removing a lens's distortion can leave.
         counted: bool `(V, H, W)`, the pixels that count, or None: all. Where somebody walked by, nothing is compared,
             and no keypoints or initial points are taken.
         gains: `(V, 3)` above 0, the factors of the scene's colours in each photo: its exposure and white balance; or
@@ -58,7 +58,7 @@ class Views:
     images: Tensor
     names: tuple[str, ...]
     masks: Tensor | None = None
-    light: Tensor | None = None
+    transmittance: Tensor | None = None
     counted: Tensor | None = None
     turned: tuple[bool, ...] | None = None
     gains: Tensor | None = None
@@ -79,8 +79,10 @@ class Views:
             raise ValueError(f"cameras: expected height {height} and width {width} as images, got others")
         if self.masks is not None and tuple(self.masks.shape) != (count, 1, height, width):
             raise ValueError(f"masks: expected shape ({count}, 1, {height}, {width}), got {tuple(self.masks.shape)}")
-        if self.light is not None and tuple(self.light.shape) != (height, width):
-            raise ValueError(f"light: expected shape ({height}, {width}), got {tuple(self.light.shape)}")
+        if self.transmittance is not None and tuple(self.transmittance.shape) != (height, width):
+            raise ValueError(
+                f"transmittance: expected shape ({height}, {width}), got {tuple(self.transmittance.shape)}"
+            )
         if self.counted is not None and tuple(self.counted.shape) != (count, height, width):
             raise ValueError(f"counted: expected shape ({count}, {height}, {width}), got {tuple(self.counted.shape)}")
         if self.gains is not None and (tuple(self.gains.shape) != (count, 3) or not bool((self.gains > 0).all())):
@@ -155,7 +157,7 @@ class Views:
         """
         image = render if self.gains is None else render * self.gains[index, :, None, None].to(render)
         image = image.clamp(0, 1)
-        return image if self.light is None else image * self.light.to(image)
+        return image if self.transmittance is None else image * self.transmittance.to(image)
 
     def compared(self, index: int, render: Tensor) -> tuple[Tensor, Tensor, float]:
         """A render `(..., 3, H, W)` as the photo of one view would show it, that photo, and the share that counts.
@@ -173,7 +175,7 @@ class Views:
     def usable(self) -> Tensor | None:
         """Which pixels show the scene: opaque ones that count and no border covers, bool `(V, H, W)`; None: all."""
         parts = [] if self.masks is None else [self.masks[:, 0] > 0.5]
-        parts += [] if self.light is None else [(self.light >= 1).expand(len(self), -1, -1)]
+        parts += [] if self.transmittance is None else [(self.transmittance >= 1).expand(len(self), -1, -1)]
         parts += [] if self.counted is None else [self.counted]
         return torch.stack(parts).all(dim=0) if parts else None
 
@@ -190,10 +192,10 @@ class Views:
         intrinsics[:, :2, 2] -= 0.25  # (c + 1/2) / 2 - 1/2: pixel centres are integers
         cameras = pinholes(intrinsics, self.cameras.extrinsics, size)
         masks = None if self.masks is None else avg_pool2d(self.masks, 2)
-        light = None if self.light is None else avg_pool2d(self.light[None], 2)[0]
+        transmittance = None if self.transmittance is None else avg_pool2d(self.transmittance[None], 2)[0]
         counted = None if self.counted is None else avg_pool2d(self.counted.float(), 2) == 1
         images = avg_pool2d(self.images, 2)
-        return replace(self, cameras=cameras, images=images, masks=masks, light=light, counted=counted)
+        return replace(self, cameras=cameras, images=images, masks=masks, transmittance=transmittance, counted=counted)
 
 
 @dataclass(frozen=True, eq=False)

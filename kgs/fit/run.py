@@ -9,9 +9,9 @@ from kgs.init_points.in_view import check_in_view
 from kgs.progress import Stage, silent
 
 from .config import FitConfig
+from .dropping import decide_drop
 from .exposure import decide_exposure
 from .fit import Fit
-from .overlap import decide_drop
 from .plan import Plan, make_plan
 from .prune import prune
 from .trainer import Trainer

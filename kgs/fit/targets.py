@@ -24,13 +24,13 @@ class Target(NamedTuple):
     clear: Tensor | None  # (1, 1, H, W), the share of the background in each pixel; None: 0 everywhere
     background: Tensor  # (3,), the background that `image` has
     gains: Tensor | None  # (3, 1, 1), the factors of the scene's colours in the photo; None: 1
-    light: Tensor | None  # (H, W), the transmittance of a dark border, and 0 where no pixel counts; None: 1 everywhere
+    transmittance: Tensor | None  # (H, W), that of a dark border, and 0 where no pixel counts; None: 1 everywhere
 
     def seen(self, render: Tensor) -> Tensor:
         """A render as the photo would show it: exposed, clamped to 1, behind its border, black where nothing counts."""
         exposed = render if self.gains is None else render * self.gains
         image: Tensor = _AtMostOne.apply(exposed)  # it is never below 0
-        return image if self.light is None else image * self.light
+        return image if self.transmittance is None else image * self.transmittance
 
     def over(self, background: Tensor, backend: str) -> Self:
         """The view before another background, `(3,)`; the backend is that of the loss."""
@@ -67,12 +67,12 @@ def targets(views: Views, background: Tensor, device: torch.device) -> list[Targ
     for i, photo in enumerate(views.images):
         image = photo[None].to(device, torch.float32)
         clear = None if views.masks is None else 1.0 - views.masks[i][None].to(image)
-        light = None if views.light is None else views.light.to(image)
+        transmittance = None if views.transmittance is None else views.transmittance.to(image)
         if views.counted is not None:
             counted = views.counted[i].to(image)
             image = image * counted
             clear = None if clear is None else clear * counted
-            light = counted if light is None else light * counted
+            transmittance = counted if transmittance is None else transmittance * counted
         made.append(
             Target(
                 camera=move_camera(views.camera(i), device),
@@ -81,7 +81,7 @@ def targets(views: Views, background: Tensor, device: torch.device) -> list[Targ
                 clear=clear,
                 background=background.to(image),
                 gains=None if views.gains is None else views.gains[i, :, None, None].to(image),
-                light=light,
+                transmittance=transmittance,
             )
         )
     return made

@@ -31,8 +31,8 @@ def test_a_quarter_turn_of_the_cameras_turns_the_render_clockwise(degrees: float
     assert torch.equal(turned.images, torch.rot90(straight.images, -quarters, (-2, -1)))
     assert turned.masks is not None
     assert torch.equal(turned.masks, turned.images[:, :1])
-    assert turned.light is not None
-    assert torch.equal(turned.light, turned.images[0, 0])
+    assert turned.transmittance is not None
+    assert torch.equal(turned.transmittance, turned.images[0, 0])
 
 
 def test_a_small_angle_tilts_the_scene_within_the_frame() -> None:

@@ -356,11 +356,11 @@ def test_ctrl_c_while_keypoints_are_matched(folder, tmp_path):
 def test_neither_solver_sees_what_alpha_hides(folder, tmp_path, monkeypatch):
     shown = []
 
-    def look(aside, step, database, images="", names=(), **_):
+    def look(process, step, database, images="", names=(), **_):
         shown.extend(cv2.imread(f"{images}/{name}", cv2.IMREAD_UNCHANGED) for name in names)
         raise RuntimeError("that is enough")
 
-    monkeypatch.setattr(pose.Aside, "run", look)
+    monkeypatch.setattr(pose.PycolmapProcesses, "run", look)
     images = planes()
     alpha = np.full((*images.shape[:3], 1), 255, np.uint8)
     alpha[:, :60] = 0

@@ -63,7 +63,7 @@ def test_the_scene_is_not_taken_for_a_border(scene):
 
 def with_border(scene, light, known=True):
     def put(views):
-        return replace(views, images=views.images * light, light=light if known else None)
+        return replace(views, images=views.images * light, transmittance=light if known else None)
 
     return replace(scene, train=put(scene.train), test=put(scene.test))
 
@@ -74,7 +74,7 @@ def test_a_render_is_measured_behind_the_border(scene):
     photos = iter(scene.test.images)
     assert evaluate(lambda _: next(photos)[None], views)["psnr"] is None  # infinite
     photos = iter(scene.test.images)
-    assert evaluate(lambda _: next(photos)[None], replace(views, light=None))["psnr"] < 30
+    assert evaluate(lambda _: next(photos)[None], replace(views, transmittance=None))["psnr"] < 30
 
 
 def test_a_border_has_no_part_in_a_fit(scene):
@@ -107,7 +107,7 @@ def test_a_render_is_compared_as_the_photo_shows_it(scene):
     """In [0, 1] and behind the border; what lies in the border is black whatever the render has there."""
     plain, light = scene.train, behind(left=1.0, top=0.0, right=0.0)
     render = torch.tensor([-0.5, 0.25, 1.5])[:, None, None].expand(3, 144, 192)
-    shown = replace(plain, light=light).as_photo(0, render)
+    shown = replace(plain, transmittance=light).as_photo(0, render)
     assert bool((shown[:, :, 0] == 0).all())
     assert shown[:, 5, 5].tolist() == [0.0, 0.25, 1.0]
     assert plain.as_photo(0, render)[:, 0, 0].tolist() == [0.0, 0.25, 1.0]
@@ -116,8 +116,8 @@ def test_a_render_is_compared_as_the_photo_shows_it(scene):
 def test_halving_and_choosing_keep_the_border(scene):
     light = behind(left=2.0, top=1.0, right=0.0)
     views = with_border(scene, light).train
-    assert views.select([1]).light is light
-    halved = views.halved().light
+    assert views.select([1]).transmittance is light
+    halved = views.halved().transmittance
     assert float(halved[20, 0]) == 0.0
     assert float(halved[0, 20]) == 0.5
 
@@ -126,22 +126,22 @@ def test_pixels_of_the_border_are_not_usable(scene):
     light = behind(left=1.0, top=0.0, right=0.0)
     masks = torch.ones(3, 1, 144, 192)
     masks[1, 0, 5, 5] = 0.2
-    views = replace(as_views(scene.train.cameras, scene.train.images, masks), light=light)
+    views = replace(as_views(scene.train.cameras, scene.train.images, masks), transmittance=light)
     assert not bool(views.usable[:, :, 0].any())
     assert views.usable[:, 5, 5].tolist() == [True, False, True]
     assert bool(views.usable[:, 6:, 6:].all())
-    assert replace(views, masks=None, light=None).usable is None
-    with pytest.raises(ValueError, match=r"light: expected shape \(144, 192\)"):
-        replace(views, light=light[1:])
+    assert replace(views, masks=None, transmittance=None).usable is None
+    with pytest.raises(ValueError, match=r"transmittance: expected shape \(144, 192\)"):
+        replace(views, transmittance=light[1:])
 
 
 def test_a_scene_is_loaded_with_its_border(kgs_data):
     loaded = load_scene(kgs_data / "nerfstudio" / "fox", 3, 2)
-    assert loaded.train.light is not None
+    assert loaded.train.transmittance is not None
     assert loaded.finer is not None
-    assert loaded.finer.light is not None
-    assert torch.equal(loaded.test.light, loaded.train.light)
-    assert 0.4 < float(loaded.train.light[120, 0]) < 0.6  # half a pixel of black on the left
-    assert bool((loaded.train.light[3:-3, 3:-3] == 1).all())
+    assert loaded.finer.transmittance is not None
+    assert torch.equal(loaded.test.transmittance, loaded.train.transmittance)
+    assert 0.4 < float(loaded.train.transmittance[120, 0]) < 0.6  # half a pixel of black on the left
+    assert bool((loaded.train.transmittance[3:-3, 3:-3] == 1).all())
     assert any("border" in note for note in loaded.notes)
-    assert load_scene(kgs_data / "llff" / "fern", 3, 2).train.light is None
+    assert load_scene(kgs_data / "llff" / "fern", 3, 2).train.transmittance is None

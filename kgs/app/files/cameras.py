@@ -105,7 +105,7 @@ def rolled(views: Views, degrees: float) -> Views:
         cameras=pinholes(lenses, poses, (height, width)),
         images=turned(views.images),
         masks=None if views.masks is None else turned(views.masks),
-        light=None if views.light is None else turned(views.light),
+        transmittance=None if views.transmittance is None else turned(views.transmittance),
         counted=None if views.counted is None else turned(views.counted),
     )
 

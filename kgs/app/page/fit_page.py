@@ -232,7 +232,7 @@ def _ground(views: Views, background: Tensor) -> Tensor:
     band = math.ceil(_BORDER * min(height, width))
     border = torch.ones(height, width, dtype=torch.bool)
     border[band : height - band, band : width - band] = False
-    usable = torch.ones_like(border) if views.light is None else views.light.cpu() >= 1
+    usable = torch.ones_like(border) if views.transmittance is None else views.transmittance.cpu() >= 1
     if views.counted is not None:
         usable = usable & views.counted.cpu().all(0)
     rows = border & usable if bool((border & usable).any()) else usable

@@ -9,11 +9,11 @@ from typing import NamedTuple
 from kgs.errors import DataError
 from kgs.progress import Stage
 
-from .aside import Aside
 from .gates import Pairs, focal_difference, focal_doubt, is_forward, judge, why_no_cameras
 from .leave_out import without_cameras, without_overlap
 from .map import Cameras, pair_geometries, quiet_pycolmap, solve, verified
 from .match import exif_focals, lenses_of, write_matches
+from .pycolmap_processes import PycolmapProcesses
 from .read import Photo
 from .write import write_images
 
@@ -61,9 +61,9 @@ def agreed_cameras(
     folder = photos[0].path.parent
     first = work / "first.db"
     second = work / "second.db"
-    with quiet_pycolmap(), ThreadPoolExecutor(1) as executor, Aside() as aside:
+    with quiet_pycolmap(), ThreadPoolExecutor(1) as executor, PycolmapProcesses() as processes:
         second_matches = executor.submit(
-            aside.run,
+            processes.run,
             "write_colmap_matches",
             second,
             images=str(_without_alpha(photos, images, work, names)),
@@ -72,7 +72,7 @@ def agreed_cameras(
             seed=seed,
         )
         write_matches(first, photos, list(names), stage)
-        aside.run("verify", first, seed=seed)
+        processes.run("verify", first, seed=seed)
         pairs = verified(first, names)
         lap("matches")
         geometries = pair_geometries(first, names)

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .aside import check_space
+from .pycolmap_processes import check_space
 
 FEWEST_MATCHES = 30  # verified matches of a pair that overlaps; of noise up to 27 were verified
 _MAX_ERROR = 1.5  # largest reprojection error, in pixels

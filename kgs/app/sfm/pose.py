@@ -24,13 +24,13 @@ from kgs.machine import versions
 from kgs.progress import Stage, silent
 
 from .agree import agreed_cameras, say_left_out
-from .aside import check_space
 from .find import find_photos, find_video
 from .gates import FEWEST_POINTS, FOCAL_RANGE, LEAST_RISE, MOST_DEGREES, MOST_RATIO
 from .leave_out import unlike_others
 from .map import Cameras, quiet_pycolmap
 from .match import exif_focal
 from .place import IMAGES, MASKS, MODEL, REPORT, check_place, is_reusable
+from .pycolmap_processes import check_space
 from .read import FILM_DIAGONAL, OpenPhoto, Photo, blurred, open_photos, read_photos
 from .video import take_frames
 from .write import level_and_scale, upright, write_images, write_masks, write_model

@@ -13,8 +13,8 @@ from kgs.app.files.outputs import write_png
 from kgs.datasets.layouts.colmap_model import read_cameras, read_images, read_points
 from kgs.errors import DataError
 
-from .aside import check_space
 from .map import Cameras, cameras_of, quiet_pycolmap
+from .pycolmap_processes import check_space
 from .read import Photo
 
 _COUNTERCLOCKWISE = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # as the picture turns

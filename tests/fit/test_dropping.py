@@ -9,7 +9,7 @@ import torch
 from kgs.datasets import synthetic_scene
 from kgs.drop import DropGaussian
 from kgs.fit.config import DROP, FitConfig
-from kgs.fit.overlap import MOST_PHOTOS, decide_drop
+from kgs.fit.dropping import MOST_PHOTOS, decide_drop
 from kgs.fit.plan import make_plan
 from kgs.fit.prune import left_out
 from kgs.fit.run import fit_scene

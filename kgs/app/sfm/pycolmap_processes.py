@@ -22,7 +22,7 @@ _LONGEST = 1000  # pixels; COLMAP's keypoints of photos reduced to this are as g
 _PROBE = 4 * 2**20  # bytes that are written to see whether a disk is full
 
 
-class Aside:
+class PycolmapProcesses:
     """Runs steps, from any thread. The end of the block ends the steps that are still at work."""
 
     def __init__(self) -> None:
