@@ -113,11 +113,6 @@ class ViewGeometry:
     def __len__(self) -> int:
         return len(self.extrinsics)
 
-    def one(self, view: int) -> Self:
-        """A single one of the cameras, V = 1."""
-        row = slice(view, view + 1)
-        return type(self)(self.intrinsics[row], self.extrinsics[row], self.sizes[row])
-
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels `(P, V, 2)` and depths `(P, V)` of P points in all cameras; pixels are invalid at depth <= 0."""
         local = torch.einsum("vij,pj->pvi", self.extrinsics[:, :3, :3], points.double()) + self.extrinsics[:, :3, 3]

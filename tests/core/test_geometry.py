@@ -64,8 +64,6 @@ def test_points_project_to_kornias_pixels_and_back():
     for view in range(3):
         back = geometry.unproject(pixels[:, view], depths[:, view], torch.full((40,), view))
         torch.testing.assert_close(back, points)
-        for ours, all_views in zip(geometry.one(view).project(points), (pixels, depths), strict=True):
-            torch.testing.assert_close(ours[:, 0], all_views[:, view])
     assert torch.equal(project_points(points, cameras)[0], pixels)
     first = (pixels[:, 0], depths[:, 0], torch.zeros(40, dtype=torch.int64))
     assert torch.equal(unproject(*first, cameras), geometry.unproject(*first))

@@ -16,12 +16,6 @@ def scene(n=60, degree=1, dtype=torch.float64, cameras=1):
     return random_gaussians(n, 0, dtype, degree, WIDTH), batch(*views)
 
 
-def assert_same(first, second):
-    """Bitwise the same list, Gaussian numbers aside."""
-    for name in ("camera_ids", *PACKED):
-        assert torch.equal(getattr(first, name), getattr(second, name)), name
-
-
 def covariances(gaussians):
     """R S S R^T in float64 with R v = q v q* / |q|^2."""
     w, x, y, z = gaussians.quats.double().unbind(1)

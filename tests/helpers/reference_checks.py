@@ -32,11 +32,6 @@ def one(
     return one_gaussian(scale, quat, mean, opacity, (1.0, 0.5, 0.25))
 
 
-def grid(height: int, width: int) -> tuple[Tensor, Tensor]:
-    y, x = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
-    return x, y
-
-
 SMALL = pinhole(4, 5, 10)
 
 
