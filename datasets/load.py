@@ -81,7 +81,7 @@ def load_scene(
             "images_8"; "": that of the largest, `images` first. See also :func:`kgs.datasets.field.field_size`.
         masks: a folder with masks of the photos, which have their stems; white is kept. None: those that the layout's
             files name, or those in `masks/`, and `dynamic_mask_*.png` beside the photos.
-        mask_means: what black in a mask means. "away": look away, somebody walked by; such pixels do not count, see
+        mask_means: what black in a mask means. "away": such pixels are ignored (somebody walked by), see
             `Views.counted`. "absent": nothing is there, as where an image is transparent.
 
     Raises:

@@ -4,7 +4,7 @@ import math
 from numbers import Integral, Real
 from typing import Any
 
-MASK_MEANINGS = ("away", "absent")  # of black in a mask: look away from it, or nothing is there
+MASK_MEANINGS = ("away", "absent")  # of black in a mask: ignored pixels, or empty space
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 

@@ -1,4 +1,4 @@
-"""Masks of photos: found, read, resized with the photo; what they leave out is looked away from, or not there."""
+"""Masks of photos: found, read, resized with the photo; what they leave out is ignored, or empty."""
 
 import json
 from collections.abc import Callable

@@ -74,7 +74,7 @@ def fit(
         frames: how many frames are taken from a video. Unless given: twelve, fewer where the camera moves little, more
             where it moves far.
         masks: folder of masks, white where a photo is kept. Unless given: masks/ beside the photos.
-        mask_means: what black in a mask means. away: look away, somebody walked by. absent: nothing is there.
+        mask_means: what black in a mask means. away: these pixels are ignored. absent: empty space.
         preset: auto: what the training views need. paper: DropGaussian's rule and recipe, as published. plain: the same
             without dropping. See --preset paper --help-all.
         detail: sets size, steps and initial points together. low: 378 pixels. high: 1000 pixels. Options given by name
