@@ -74,7 +74,7 @@ def contents(out: Path) -> dict[str, bytes]:
 
 
 def full(path: Any, *_: Any) -> Any:
-    """In the place of what writes, on a full disk."""
+    """Stands in for a write on a full disk."""
     raise OSError(28, "No space left on device", str(path))
 
 

@@ -14,6 +14,9 @@ from tiny_scenes import write_blender, write_colmap, write_llff, write_nerfstudi
 from kgs.datasets import load_scene
 from kgs.datasets.scene import Views
 from kgs.errors import DataError
+from kgs.fit.config import FitConfig
+from kgs.fit.measures import measure
+from kgs.fit.run import fit_scene
 from kgs.fit.targets import targets
 from kgs.init_points.tracks import detect
 from kgs.metrics.evaluate import evaluate, mean_psnr
@@ -86,6 +89,16 @@ def test_black_is_not_there(tmp_path: Path) -> None:
     plain = load_scene(tmp_path, hold_out=0)
     assert plain.train.counted is None
     assert torch.equal(plain.train.images[0, :, :, 8:], scene.train.images[0, :, :, 8:])
+
+
+def test_metrics_say_which_pixels_were_compared(tmp_path: Path) -> None:
+    write_llff(tmp_path)
+    config = FitConfig(steps=1, evaluations=1, init="random", init_points=20)
+    for name, expected in (("whole", "all pixels"), ("masked", "the pixels that count")):
+        if name == "masked":
+            write_mask(tmp_path / "masks" / "0.png")
+        fit = fit_scene(load_scene(tmp_path, hold_out=0), config)
+        assert expected in measure(fit)["protocol"]["psnr"]
 
 
 def test_a_mask_is_reduced_with_its_photo(tmp_path: Path) -> None:

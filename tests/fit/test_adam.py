@@ -57,6 +57,17 @@ def test_parameters_and_moments_are_those_of_torch_bit_for_bit(dtype):
         assert all(torch.equal(value, theirs_state[name][key]) for key, value in ours_state[name].items())
 
 
+def test_a_state_that_was_loaded_does_not_change_with_the_steps():
+    adam = Adam(groups(torch.float32))
+    train(adam, 2, 1)
+    state = adam.state_dict()
+    before = {key: value.clone() for key, value in state["means"].items()}
+    other = Adam(groups(torch.float32))
+    other.load_state_dict(state)
+    train(other, 2, 2)
+    assert all(torch.equal(value, before[key]) for key, value in state["means"].items())
+
+
 def test_no_gradient_is_left():
     adam = Adam(groups(torch.float32))
     train(adam, 1, 0)

@@ -113,6 +113,11 @@ def test_training_views_are_compared_as_they_were_exposed_and_both_measures_are_
     assert metrics["needs"]["exposure"]["n"] >= MIN_PATCHES
 
 
+def test_a_fit_without_its_history_cannot_be_measured(fit):
+    with pytest.raises(ValueError, match="fit: expected"):
+        measure(replace(fit, history={}))
+
+
 def test_the_presets_of_the_paper_have_none(exposed):
     for name in ("paper", "plain"):
         config = PRESETS[name]
