@@ -3,6 +3,7 @@
 import difflib
 import errno
 import inspect
+import re
 import sys
 import traceback
 import warnings
@@ -83,8 +84,8 @@ def exit_code(words: list[str]) -> int:
         message = str(DataError(error.path, flags.get(error.field, error.field), error.reason))
     except ValueError as error:
         argument, colon, reason = str(error).partition(":")
-        if argument not in flags and " expected " not in str(error):
-            raise  # a mistake in kgs
+        if re.match(r"\w+: ", str(error)) is None and " expected " not in str(error):
+            raise  # a mistake in kgs: messages for users begin with a name
         message = printable(flags.get(argument, argument) + colon + reason)
     except TrainingDiverged as error:
         message = printable(f"training diverged: {error}")
