@@ -1,9 +1,13 @@
-"""Progress of long loops: functions take a wrapper for their loop, which may display a bar."""
+"""Progress of long loops: functions wrap their loops in a `ProgressBar` of the caller.
+
+>>> from tqdm import tqdm
+>>> bar = lambda items, title, unit: tqdm(items, desc=title, unit=f" {unit}")
+"""
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-Stage = Callable[[Sequence[Any], str, str], Iterable[Any]]  # items, title, name of one item
+ProgressBar = Callable[[Sequence[Any], str, str], Iterable[Any]]  # items, title, name of one item: the same items
 
 
 def silent(items: Sequence[Any], title: str, unit: str) -> Iterable[Any]:

@@ -20,7 +20,7 @@ from kgs.camera import move_camera
 from kgs.geometry import NEIGHBOURS, camera_centers, log_spacing, nearest_pixels, project_points, typical_depths
 from kgs.metrics.evaluate import comparable
 from kgs.model import GaussianModel
-from kgs.progress import Stage, silent
+from kgs.progress import ProgressBar, silent
 from kgs.renderer import GaussianRenderer
 
 from .fit import Fit
@@ -148,7 +148,7 @@ def find_strays(
     return Strays(giants.to(place), needles.to(place), floaters.to(place))
 
 
-def clean(fit: Fit, strength: float = 1.0, stage: Stage = silent) -> Cleaned:
+def clean(fit: Fit, strength: float = 1.0, bar: ProgressBar = silent) -> Cleaned:
     """The fit without the floaters, giants and needles that its training views do not need.
 
     The candidates are those of :func:`find_strays`, in the order of how much a view changes without them: the squared
@@ -159,7 +159,7 @@ def clean(fit: Fit, strength: float = 1.0, stage: Stage = silent) -> Cleaned:
     Args:
         fit: a splat with the cameras and photos that it was fitted to.
         strength: above 0, at most `MAX_STRENGTH`.
-        stage: shows the progress, as `tqdm` does.
+        bar: wraps the loops to show their progress, see :mod:`kgs.progress`.
 
     Raises:
         ValueError: the scene was loaded without photos, the strength is out of range, or no Gaussian would be left.
@@ -172,7 +172,7 @@ def clean(fit: Fit, strength: float = 1.0, stage: Stage = silent) -> Cleaned:
     strays = find_strays(fit.model, strength, views.cameras, [fit.median_depth(camera) for camera in cameras])
     before = training_levels(fit)
     candidates = strays.any.nonzero()[:, 0]
-    order = candidates[_changes(fit, strays.any, stage).argsort()]
+    order = candidates[_changes(fit, strays.any, bar).argsort()]
     cleaned = fit
     after = before
     fewest = 0
@@ -257,7 +257,7 @@ def _near(means: Tensor, cameras: PinholeCamera, confirmed: Tensor, share: float
     return near
 
 
-def _changes(fit: Fit, rows: Tensor, stage: Stage) -> Tensor:
+def _changes(fit: Fit, rows: Tensor, bar: ProgressBar) -> Tensor:
     """How much the image of a training view changes without each of the Gaussians at `rows`, bool `(N,)`; `(M,)`.
 
     The largest over the views of the squared change, summed over the pixels that count, over the mean squared error of
@@ -270,7 +270,7 @@ def _changes(fit: Fit, rows: Tensor, stage: Stage) -> Tensor:
     with torch.no_grad():
         gaussians = fit.model()
     changes = torch.zeros_like(gaussians.opacities)
-    for i in stage(range(len(views)), "strays", "view"):
+    for i in bar(range(len(views)), "strays", "view"):
         camera = move_camera(views.camera(i), fit.device)
         squares = torch.zeros_like(changes)
         for _ in range(_SIGNS):

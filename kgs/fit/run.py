@@ -6,7 +6,7 @@ from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 from kgs.init_points import InitialPoints, initial_points
 from kgs.init_points.in_view import check_in_view
-from kgs.progress import Stage, silent
+from kgs.progress import ProgressBar, silent
 
 from .config import FitConfig
 from .dropping import decide_drop
@@ -18,13 +18,13 @@ from .trainer import Trainer
 from .view_dependence import decide_degree
 
 
-def fit_scene(scene: Scene, config: FitConfig | None = None, *, stage: Stage = silent) -> Fit:
+def fit_scene(scene: Scene, config: FitConfig | None = None, *, bar: ProgressBar = silent) -> Fit:
     """Fit a scene; nothing is written. `kgs fit` does the same and writes a folder.
 
     Args:
         scene: posed training and test views; the test views are rendered only for the curve.
         config: the settings; None: the defaults.
-        stage: shows how far the initial points are, as `tqdm` does.
+        bar: wraps the loops to show their progress, see :mod:`kgs.progress`.
 
     Raises:
         DataError: the scene, or the file of initial points, has none.
@@ -33,7 +33,7 @@ def fit_scene(scene: Scene, config: FitConfig | None = None, *, stage: Stage = s
     """
     config = FitConfig() if config is None else config
     plan = make_plan(scene, config)
-    points = choose_points(scene, config, stage)
+    points = choose_points(scene, config, bar)
     return prune(Trainer(scene, decide(plan, points), points).fit())
 
 
@@ -42,13 +42,13 @@ def decide(plan: Plan, points: InitialPoints) -> Plan:
     return decide_exposure(decide_drop(decide_degree(plan, points), points), points)
 
 
-def choose_points(scene: Scene, config: FitConfig, stage: Stage = silent) -> InitialPoints:
+def choose_points(scene: Scene, config: FitConfig, bar: ProgressBar = silent) -> InitialPoints:
     """Make the initial points that `config.init` asks for.
 
     Args:
         scene: the scene to fit; test views are not used.
         config: the settings of the fit.
-        stage: shows the progress.
+        bar: wraps the loops to show their progress, see :mod:`kgs.progress`.
 
     Raises:
         DataError: the scene, or the file, has none, or no training image shows one.
@@ -72,6 +72,6 @@ def choose_points(scene: Scene, config: FitConfig, stage: Stage = silent) -> Ini
         "file": config.init_file,
         "origin": scene.offset,  # files that kgs writes are in the world's coordinates
     }
-    points = initial_points(views, kind, stage=stage, backend=config.backend, **options)
+    points = initial_points(views, kind, bar=bar, backend=config.backend, **options)
     check_in_view(points.points, scene.train, config.init_file or scene.root)
     return points

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kgs.datasets.scene import Views
 from kgs.geometry import ViewGeometry
-from kgs.progress import Stage, silent
+from kgs.progress import ProgressBar, silent
 from kgs.types import check_kind
 
 from .dense import FEWEST, dense_points
@@ -53,7 +53,7 @@ def initial_points(
     pixels: int | None = None,
     file: str | PathLike[str] | None = None,
     origin: Tensor | None = None,
-    stage: Stage = silent,
+    bar: ProgressBar = silent,
     backend: str = "auto",
     draw: str = "uniform",
 ) -> InitialPoints:
@@ -77,7 +77,7 @@ def initial_points(
         file: the file of the kind "file".
         origin: subtracted from the points of the file, `(3,)`: the `offset` of the scene, if the file has its world
             coordinates.
-        stage: displays the progress: :func:`kgs.app.console.each`, or nothing.
+        bar: wraps the loops to show their progress, see :mod:`kgs.progress`.
         backend: one of :func:`kgs.backends.available`, for "dense" and "sift".
         draw: how "dense" points are drawn: "uniform", or "spread" evenly over the images.
 
@@ -101,11 +101,11 @@ def initial_points(
             raise ValueError("file: expected a path for the kind 'file', got None")
         return InitialPoints(*read_points(Path(file), origin), kind)
     geometry = ViewGeometry.of(views.cameras)
-    tracked = certain_points(views, geometry, stage, backend)
+    tracked = certain_points(views, geometry, bar, backend)
     generator = torch.Generator().manual_seed(seed)
     if kind == "dense":
         near, far = sweep_range(tracked, geometry)
-        dense = dense_points(views, near, far, count, generator, stage, backend, draw, pixels)
+        dense = dense_points(views, near, far, count, generator, bar, backend, draw, pixels)
         if dense.agreed >= (MIN_DENSE if count is None else min(MIN_DENSE, count)):
             return InitialPoints(dense.points, dense.colors, kind, dense.patches, dense.views)
         message = (

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from kgs.datasets.scene import Views
 from kgs.geometry import ViewGeometry
-from kgs.progress import Stage, silent
+from kgs.progress import ProgressBar, silent
 
 from .agreement import agreed_pixels, average_depths
 from .patches import PatchColors, patch_colors
@@ -53,7 +53,7 @@ def dense_points(
     far: float,
     count: int | None,
     generator: torch.Generator,
-    stage: Stage = silent,
+    bar: ProgressBar = silent,
     backend: str = "auto",
     draw: str = "uniform",
     pixels: int | None = None,
@@ -70,7 +70,7 @@ def dense_points(
     """
     pixels = pixels or views.images[:, 0].numel()
     views = small_enough(views, near, far)
-    maps, certain = agreed_depths(views, near, far, stage, backend)
+    maps, certain = agreed_depths(views, near, far, bar, backend)
     geometry = ViewGeometry.of(views.cameras)
     parts = [_agreed(views, geometry, maps, certain, view) for view in range(len(views))]
     points, colors, places = map(torch.cat, zip(*parts, strict=True))
@@ -101,10 +101,10 @@ def small_enough(views: Views, near: float, far: float) -> Views:
 
 
 def agreed_depths(
-    views: Views, near: float, far: float, stage: Stage = silent, backend: str = "auto"
+    views: Views, near: float, far: float, bar: ProgressBar = silent, backend: str = "auto"
 ) -> tuple[list[DepthMap], list[Tensor]]:
     """The depth maps of the views, averaged, and the pixels that count: inside, usable and well matched."""
-    maps = sweep_depths(views, near, far, stage, backend, to_infinity=True)
+    maps = sweep_depths(views, near, far, bar, backend, to_infinity=True)
     certain = [depth_map.is_inner & (depth_map.scores > SCORE) for depth_map in maps]
     if views.usable is not None:
         certain = [mask & usable for mask, usable in zip(certain, views.usable.cpu(), strict=True)]

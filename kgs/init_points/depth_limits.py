@@ -6,7 +6,7 @@ from torch import Tensor
 
 from kgs.datasets.scene import Views
 from kgs.geometry import ViewGeometry, log_spacing, meeting_point
-from kgs.progress import Stage, silent
+from kgs.progress import ProgressBar, silent
 
 from .tracks import find_tracks
 from .triangulate import TrackedPoints, triangulate_certain
@@ -15,9 +15,11 @@ MIN_SIFT = 20  # a fit from fewer SIFT points is worse than one from random poin
 MAX_SPACING = 4.0  # a point is isolated if its distance to its neighbours is larger than this times the median
 
 
-def certain_points(views: Views, geometry: ViewGeometry, stage: Stage = silent, backend: str = "auto") -> TrackedPoints:
+def certain_points(
+    views: Views, geometry: ViewGeometry, bar: ProgressBar = silent, backend: str = "auto"
+) -> TrackedPoints:
     """The triangulated SIFT points of typical depths; if these are at least `MIN_SIFT`, without isolated ones."""
-    tracked = triangulate_certain(find_tracks(views, stage, backend), geometry)
+    tracked = triangulate_certain(find_tracks(views, bar, backend), geometry)
     tracked = tracked.select(_within_typical_depths(tracked))
     return tracked.select(_has_neighbours(tracked, geometry)) if len(tracked) >= MIN_SIFT else tracked
 

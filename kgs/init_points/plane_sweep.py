@@ -13,7 +13,7 @@ from torch import Tensor
 
 from kgs.datasets.scene import Views
 from kgs.geometry import ViewGeometry
-from kgs.progress import Stage, silent
+from kgs.progress import ProgressBar, silent
 
 from .sweep_costs import sweep_costs
 
@@ -38,7 +38,7 @@ def sweep_depths(
     views: Views,
     near: float,
     far: float,
-    stage: Stage = silent,
+    bar: ProgressBar = silent,
     backend: str = "auto",
     *,
     to_infinity: bool = False,
@@ -63,7 +63,7 @@ def sweep_depths(
     geometry = ViewGeometry.of(views.cameras)
     memory = torch.empty(2, *grey.shape[1:], len(inverse))
     maps = []
-    for view in stage(range(len(views)), "depth maps", "view"):
+    for view in bar(range(len(views)), "depth maps", "view"):
         others = _neighbours(geometry, view, typical)
         if others:
             homographies = torch.stack([_homographies(geometry, view, other, inverse) for other in others])

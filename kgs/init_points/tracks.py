@@ -16,7 +16,7 @@ from torch import Tensor
 
 from kgs.datasets.scene import Views
 from kgs.init_points.keypoints import root_sift
-from kgs.progress import Stage, silent
+from kgs.progress import ProgressBar, silent
 
 from .matching import match
 
@@ -35,7 +35,7 @@ class Tracks:
         return type(self)(self.pixels[rows], self.visible[rows])
 
 
-def find_tracks(views: Views, stage: Stage = silent, backend: str = "auto") -> Tracks:
+def find_tracks(views: Views, bar: ProgressBar = silent, backend: str = "auto") -> Tracks:
     """Find points that at least two of the views see, at usable pixels.
 
     Two keypoints match if each is the other's nearest in RootSIFT among those near its epipolar line (under the given
@@ -44,11 +44,11 @@ def find_tracks(views: Views, stage: Stage = silent, backend: str = "auto") -> T
     """
     # The cost of matching grows with the squares of both counts, so many views get fewer keypoints each.
     limit = min(max(48_000 // len(views), 1500), 12_000)
-    features = [detect(views, view, limit) for view in stage(range(len(views)), "keypoints", "view")]
+    features = [detect(views, view, limit) for view in bar(range(len(views)), "keypoints", "view")]
     projections = (views.cameras.intrinsics.double() @ views.cameras.extrinsics.double())[:, :3].cpu()
     nodes, pixels, owners = _places([places for places, _ in features])
     links = list[tuple[float, int, int]]()
-    for i, j in stage(list(combinations(range(len(views)), 2)), "matches", "pair"):
+    for i, j in bar(list(combinations(range(len(views)), 2)), "matches", "pair"):
         places1, descriptors1 = features[i]
         places2, descriptors2 = features[j]
         lines = _lines(places1, projections[i], projections[j])

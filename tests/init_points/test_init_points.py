@@ -161,7 +161,7 @@ def test_each_stage_says_how_far_it_is(planes: Views, capsys: pytest.CaptureFixt
     small = planes.halved()
     initial_points(small, "dense")
     assert capsys.readouterr() == ("", "")  # nothing unless asked for
-    initial_points(small, "dense", stage=each)
+    initial_points(small, "dense", bar=each)
     lines = capsys.readouterr().err.splitlines()
     assert lines == [
         *(f"keypoints: {k} of 3 views" for k in (1, 2, 3)),

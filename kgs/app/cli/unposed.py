@@ -50,7 +50,7 @@ def find_scene(
         say(note)
     with on_ctrl_c("the cameras were not found yet, and nothing was written"):
         masks = request.masks or None
-        report = pose_photos(photos, out, seed=seed, masks=masks, frames=frames, wait=True, stage=each, say=say)
+        report = pose_photos(photos, out, seed=seed, masks=masks, frames=frames, wait=True, bar=each, say=say)
     largest = max(report["size"])
     wanted = largest if size is None else size
     if request.downscale is not None:

@@ -15,7 +15,7 @@ from torch.nn.functional import normalize
 
 from kgs.datasets.scene import Views, pinholes
 from kgs.geometry import camera_centers, meeting_point, typical_depths
-from kgs.progress import Stage, silent
+from kgs.progress import ProgressBar, silent
 
 from .cameras import upright
 from .encoders import encode
@@ -37,7 +37,7 @@ def write_film(
     render: Callable[[PinholeCamera], Tensor],
     views: Views,
     depth: float,
-    stage: Stage = silent,
+    bar: ProgressBar = silent,
 ) -> str:
     """Write a film along the :func:`tour` through some views, as MP4 or WebM by the suffix. The write is atomic.
 
@@ -49,7 +49,7 @@ def write_film(
         render: from a camera to an image `(1, 3, H, W)`.
         views: the views whose cameras the path passes.
         depth: distance from the cameras to the scene, in world units.
-        stage: wraps the poses to show progress, such as :func:`kgs.app.console.each`.
+        bar: wraps the loops to show their progress, see :mod:`kgs.progress`.
 
     Returns:
         "", or the reason why no film was written: there is no encoder for it here.
@@ -58,7 +58,7 @@ def write_film(
     size, lens = _frame_lens(views)
     poses = paced(views.cameras.extrinsics, FRAMES, depth).to(lens)
     part = path.with_name(f".{path.name}")  # OpenCV chooses the format by the suffix
-    cameras = (pinholes(lens[None], pose[None], size) for pose in stage(list(poses), "film", "frame"))
+    cameras = (pinholes(lens[None], pose[None], size) for pose in bar(list(poses), "film", "frame"))
     try:
         if why := encode(part, (eight_bits(render(camera)[0]) for camera in cameras), size[::-1]):
             return f"no {path.name}: {why}"

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from kgs.errors import DataError
-from kgs.progress import Stage
+from kgs.progress import ProgressBar
 
 from .gates import Pairs, focal_difference, focal_doubt, is_forward, judge, why_no_cameras
 from .leave_out import without_cameras, without_overlap
@@ -38,7 +38,7 @@ def agreed_cameras(
     work: Path,
     names: Mapping[str, str],
     seed: int,
-    stage: Stage,
+    bar: ProgressBar,
     lap: Callable[[str], None],
     say: Callable[[str], None],
 ) -> Agreed:
@@ -51,7 +51,7 @@ def agreed_cameras(
         work: a folder for what the solvers write.
         names: the names of the photos by those of the PNGs, in the order of `photos`.
         seed: of the solvers.
-        stage: shows how far the work is.
+        bar: wraps the loops to show their progress, see :mod:`kgs.progress`.
         lap: called with the name of each part at its end.
         say: called with each line for the user.
 
@@ -71,7 +71,7 @@ def agreed_cameras(
             masks=str(masks) if masks.is_dir() else None,
             seed=seed,
         )
-        write_matches(first, photos, list(names), stage)
+        write_matches(first, photos, list(names), bar)
         processes.run("verify", first, seed=seed)
         pairs = verified(first, names)
         lap("matches")

@@ -13,7 +13,7 @@ from kornia.feature import laf_from_center_scale_ori, match_adalam
 from torch import Tensor
 
 from kgs.init_points.keypoints import root_sift
-from kgs.progress import Stage
+from kgs.progress import ProgressBar
 
 from .read import Photo
 
@@ -46,24 +46,24 @@ def find_keypoints(photo: Photo, most: int) -> PhotoKeypoints:
     return PhotoKeypoints(places, keypoints.descriptors, frames)
 
 
-def write_matches(database: Path, photos: list[Photo], names: list[str], stage: Stage) -> None:
+def write_matches(database: Path, photos: list[Photo], names: list[str], bar: ProgressBar) -> None:
     """Make a COLMAP database of all photos with their lenses, their keypoints and the matches of each pair.
 
     Args:
         database: the file to write.
         photos: the photos, all of one size.
         names: their names in the database.
-        stage: shows how far the work is.
+        bar: wraps the loops to show their progress, see :mod:`kgs.progress`.
     """
     # The cost of matching grows with the squares of both counts, so many photos get fewer keypoints each.
     most = min(MOST_KEYPOINTS, max(FEWEST_KEYPOINTS, ALL_KEYPOINTS // len(photos)))
-    keypoints = [find_keypoints(photo, most) for photo in stage(photos, "keypoints", "photo")]
+    keypoints = [find_keypoints(photo, most) for photo in bar(photos, "keypoints", "photo")]
     area = photos[0].size[::-1]
     with _open(database) as file:
         ids = _write_photos(file, photos, names)
         for image_id, of_photo in zip(ids, keypoints, strict=True):
             file.write_keypoints(image_id, of_photo.places.numpy())
-        for i, j in stage(list(combinations(range(len(photos)), 2)), "matches", "pair"):
+        for i, j in bar(list(combinations(range(len(photos)), 2)), "matches", "pair"):
             pairs = _match(keypoints[i], keypoints[j], area)
             if len(pairs) >= _FEWEST_MATCHES:
                 file.write_matches(ids[i], ids[j], pairs.numpy().astype("uint32"))

@@ -21,7 +21,7 @@ from kgs.datasets.masks import mask_folder
 from kgs.errors import DataError
 from kgs.json_files import read_json, write_json
 from kgs.machine import versions
-from kgs.progress import Stage, silent
+from kgs.progress import ProgressBar, silent
 
 from .agree import agreed_cameras, say_left_out
 from .find import find_photos, find_video
@@ -46,7 +46,7 @@ def pose_photos(
     masks: str | PathLike[str] | None = None,
     frames: int | None = None,
     wait: bool = False,
-    stage: Stage = silent,
+    bar: ProgressBar = silent,
     say: Callable[[str], None] = say,
 ) -> dict[str, Any]:
     """Find the cameras of unposed photos, and write a scene that `kgs.datasets.load_scene` reads.
@@ -70,7 +70,7 @@ def pose_photos(
         seed: of the solvers. The same photos and seed give the same files, but for the times in photos.json.
         frames: the number of frames that are taken from a video; see :func:`kgs.app.sfm.video.take_frames`.
         wait: leave new files in `out/finished-photos` if `out` holds a fit, which belongs to the former cameras.
-        stage: shows how far each part is, as `kgs.app.console.each` does.
+        bar: wraps the loops to show their progress, see :mod:`kgs.progress`.
         say: called with each line for the user.
 
     Returns:
@@ -88,7 +88,7 @@ def pose_photos(
     """
     folder = Path(folder)
     out = Path(out)
-    options: dict[str, Any] = {"seed": seed, "masks": masks, "wait": wait, "stage": stage, "say": say}
+    options: dict[str, Any] = {"seed": seed, "masks": masks, "wait": wait, "bar": bar, "say": say}
     if video := find_video(folder):
         return _pose_video(video, out, frames, options)
     with quiet_pycolmap():  # a missing package is an error before any work
@@ -117,7 +117,7 @@ def pose_photos(
             new = staging.unfinished
             staging.start()
             try:
-                write_json(new / REPORT, inputs | find_cameras(opened, new, seed % 2**31, stage, say))
+                write_json(new / REPORT, inputs | find_cameras(opened, new, seed % 2**31, bar, say))
                 staging.seal()
             finally:
                 shutil.rmtree(new, ignore_errors=True)
@@ -135,7 +135,7 @@ def _pose_video(video: Path, out: Path, frames: int | None, options: dict[str, A
     with TemporaryDirectory(prefix="kgs-") as name:
         folder = Path(name) / video.stem
         folder.mkdir()
-        take_frames(video, folder, frames, options["stage"], options["say"])
+        take_frames(video, folder, frames, options["bar"], options["say"])
         try:
             return pose_photos(folder, out, **options)
         except DataError as error:
@@ -143,7 +143,7 @@ def _pose_video(video: Path, out: Path, frames: int | None, options: dict[str, A
 
 
 def find_cameras(
-    opened: list[OpenPhoto], new: Path, seed: int, stage: Stage, say: Callable[[str], None]
+    opened: list[OpenPhoto], new: Path, seed: int, bar: ProgressBar, say: Callable[[str], None]
 ) -> dict[str, Any]:
     """Write `images` and `sparse/0` of photos to the folder `new`; returns the report.
 
@@ -160,7 +160,7 @@ def find_cameras(
     for path in (images, work):
         path.mkdir(parents=True)
     with _one_thread(), report_full_disk(new):
-        photos = read_photos(opened, stage)
+        photos = read_photos(opened, bar)
         for photo in photos:
             if photo.whole:
                 say(f"{photo.name}: only its middle is taken, because it has another shape than most photos")
@@ -179,7 +179,7 @@ def find_cameras(
             write_images(places[0], photos, list(png.values()))
             write_masks(places[1], photos, list(png.values()))
         lap("photos")
-        found = agreed_cameras(photos, *places, work, photo_names, seed, stage, lap, say)
+        found = agreed_cameras(photos, *places, work, photo_names, seed, bar, lap, say)
         for name in found.left_out:
             (images / png[name]).unlink()
             (new / MASKS / f"{png[name]}.png").unlink(missing_ok=True)

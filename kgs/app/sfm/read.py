@@ -21,7 +21,7 @@ from kgs.datasets.image_file import ImageFile, turn
 from kgs.datasets.images import Intrinsics
 from kgs.datasets.masks import Mask, find_masks
 from kgs.errors import DataError
-from kgs.progress import Stage
+from kgs.progress import ProgressBar
 
 from .find import CONVERT
 
@@ -194,7 +194,7 @@ def _open(path: Path, mask: Mask | None) -> OpenPhoto:
     return OpenPhoto(path, hashlib.sha256(data).hexdigest(), exif, size, image, mask)
 
 
-def read_photos(opened: list[OpenPhoto], stage: Stage) -> list[Photo]:
+def read_photos(opened: list[OpenPhoto], bar: ProgressBar) -> list[Photo]:
     """Decode photos, turn them as their Exif says, and reduce them to the size of the smallest or to 1600 pixels.
 
     All get the shape of most, or that and its upright or lying counterpart; of these two the rarer is turned. Of photos
@@ -212,7 +212,7 @@ def read_photos(opened: list[OpenPhoto], stage: Stage) -> list[Photo]:
     size = max(1, round(width * scale)), max(1, round(height * scale))
     lenses = _lens_numbers(opened)
     photos = []
-    for photo in stage(opened, "photos", "photo"):
+    for photo in bar(opened, "photos", "photo"):
         pixels = photo.image.read()
         is_turned = lies[photo.name] != most_lie and width != height
         part = size[::-1] if is_turned else size

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from kgs.app.files.outputs import write_png
 from kgs.errors import DataError
-from kgs.progress import Stage
+from kgs.progress import ProgressBar
 
 from .find import FEWEST
 from .match import DEFAULT_FOCAL
@@ -48,7 +48,9 @@ class _Frame(NamedTuple):
     way: float  # by how many degrees the camera had moved
 
 
-def take_frames(video: Path, folder: Path, count: int | None, stage: Stage, say: Callable[[str], None]) -> list[Path]:
+def take_frames(
+    video: Path, folder: Path, count: int | None, bar: ProgressBar, say: Callable[[str], None]
+) -> list[Path]:
     """Write frames of a video to a folder, upright as its header says, as PNGs in the order of time.
 
     Args:
@@ -56,13 +58,13 @@ def take_frames(video: Path, folder: Path, count: int | None, stage: Stage, say:
         folder: an empty folder.
         count: the number of frames; None: twelve, fewer where neighbours would be less than 3 degrees apart, and up to
             36 where they would be more than 10 apart.
-        stage: shows how far the work is.
+        bar: wraps the loops to show their progress, see :mod:`kgs.progress`.
         say: called with a line about the frames.
 
     Raises:
         DataError: the file is not a video that can be read, or the camera moves too little in it.
     """
-    frames = _look(video, stage)
+    frames = _look(video, bar)
     way = frames[-1].way
     least = _STEP * ((count or FEWEST) - 1)
     if way < least or len(frames) < FEWEST:
@@ -74,7 +76,7 @@ def take_frames(video: Path, folder: Path, count: int | None, stage: Stage, say:
     indices = _sharpest(frames, count)
     paths = []
     with _Reader(video) as reader:
-        for index in stage(indices, "frames", "frame"):
+        for index in bar(indices, "frames", "frame"):
             pixels = reader.read(index)
             if pixels is None:
                 raise DataError(video, "", f"frame {index} cannot be read a second time")
@@ -84,13 +86,13 @@ def take_frames(video: Path, folder: Path, count: int | None, stage: Stage, say:
     return paths
 
 
-def _look(video: Path, stage: Stage) -> list[_Frame]:
+def _look(video: Path, bar: ProgressBar) -> list[_Frame]:
     """Frames spread over a video, at least one, with their sharpness and how far the camera had moved."""
     frames = list[_Frame]()
     with _Reader(video) as reader:
         motion = _Motion()
         every = max(1, reader.count // _LOOKED_AT)
-        for index in stage(range(0, reader.count, every), "video", "frame"):
+        for index in bar(range(0, reader.count, every), "video", "frame"):
             pixels = reader.read(index)
             if pixels is None:
                 break
