@@ -234,7 +234,7 @@ def check_saved(saved: dict[str, Any], scene: dict[str, Any], config: FitConfig,
     planned = saved["config"]["steps"]
     done = saved["step"]
     notes = list[str]()
-    asked = config.to_dict() | {"device": saved["config"].get("device")}  # a fit may continue on another device
+    asked = config.to_dict() | {"device": saved["config"]["device"]}  # a fit may continue on another device
     if config.backend == "auto":
         asked["backend"] = saved["backend"]
     if planned == done < steps:
@@ -247,11 +247,10 @@ def check_saved(saved: dict[str, Any], scene: dict[str, Any], config: FitConfig,
     elif planned != steps or done > planned:
         expected = f"{planned}, as the fit was begun with," if done < planned else f"at least the {done} that are done,"
         raise ValueError(f"steps: expected {expected} got {steps}")
-    new = {"exposure": "auto"}  # of fits from before there was this entry
-    _compare_settings(new | saved["config"] | {"backend": saved["backend"]}, asked)
+    _compare_settings(saved["config"] | {"backend": saved["backend"]}, asked)
     for part in ("training", "test"):
         for what, sums in scene[part].items():
-            before = saved["scene"][part].get(what)  # former versions had fewer entries
+            before = saved["scene"][part][what]
             if before != sums:
                 both = zip(scene[part]["names"], before or [], sums or [], strict=False)
                 changed = ", ".join(name for name, one, other in both if one != other)
