@@ -133,12 +133,12 @@ class Views:
 
     def select(self, indices: Sequence[int]) -> Self:
         """The views at the given positions, in that order."""
-        rows = torch.tensor(indices, dtype=torch.int64, device=self.images.device)
+        rows = torch.tensor(indices, dtype=torch.int64, device="cpu")
         masks = None if self.masks is None else self.masks[rows]
         counted = None if self.counted is None else self.counted[rows]
         names = tuple(self.names[i] for i in indices)
         turned = None if self.turned is None else tuple(self.turned[i] for i in indices)
-        gains = None if self.gains is None else self.gains[rows.to(self.gains.device)]
+        gains = None if self.gains is None else self.gains[rows]
         return replace(
             self,
             cameras=self.camera(rows),
@@ -153,7 +153,8 @@ class Views:
     def as_photo(self, index: int, render: Tensor) -> Tensor:
         """A render `(..., 3, H, W)` as the photo of one view would show it.
 
-        Its colours are multiplied by the gains of the view and clamped to [0, 1], behind the photos' dark border.
+        Its colours are multiplied by the gains of the view and clamped to [0, 1], behind the photos' dark border. Where
+        there are gains the background should be black: it is multiplied, too.
         """
         image = render if self.gains is None else render * self.gains[index, :, None, None].to(render)
         image = image.clamp(0, 1)

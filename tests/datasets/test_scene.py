@@ -149,5 +149,8 @@ def test_cameras_without_decoding_photos(tmp_path, monkeypatch, write, downscale
         assert part.images.shape == full.images.shape
         assert part.images.is_meta
         assert part[0]["name"] == full.names[0]
+        last = part.select([len(part) - 1])
+        assert last.names == full.names[-1:]
+        assert torch.equal(last.cameras.extrinsics, full.cameras.extrinsics[-1:])
     assert torch.equal(bare.offset, whole.offset)
     assert bare.finer is None
