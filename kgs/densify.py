@@ -218,7 +218,7 @@ class Densifier:
         if not 0.0 < factor < 1.0:
             raise ValueError(f"factor: expected a number in (0, 1), got {factor}")
         logits = self.model.opacity_logits  # of f s(x): log f - log(e^-x + 1 - f)
-        logits.copy_(math.log(factor) - torch.logaddexp(-logits, torch.full_like(logits[0], 1.0 - factor).log()))
+        logits.copy_(math.log(factor) - torch.logaddexp(-logits, logits.new_full((), 1.0 - factor).log()))
 
     def state_dict(self) -> dict[str, Tensor]:
         """The statistics and the generator's state, for a checkpoint."""

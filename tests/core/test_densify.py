@@ -208,3 +208,14 @@ def test_decay_multiplies_opacities():
     densifier.decay_opacity(0.99)
     assert model.opacity_logits is parameter
     np.testing.assert_allclose(model.opacity_logits.detach().double().sigmoid(), 0.99 * before, rtol=2e-6)
+
+
+def test_gaussians_that_are_all_pruned_can_decay():
+    model = random_model(5, 0)
+    with torch.no_grad():
+        model.opacity_logits.fill_(-30.0)
+    densifier = Densifier(model, torch.optim.Adam(model.parameters()), 1.0)
+    assert densifier.step().total == 0
+    densifier.decay_opacity(0.99)
+    densifier.reset_opacity()
+    assert len(model) == 0
