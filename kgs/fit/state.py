@@ -167,7 +167,6 @@ class TrainState:
         On another kind of device random numbers start a new sequence, which `notes` says.
         """
         with state_errors():
-            check_plain(values, *PLAIN)
             model = GaussianModel(**copy.deepcopy(values["model"]))
             if model.max_sh_degree != (plan.config.sh_degree or 0) or model.means.dtype != torch.float32:
                 raise ValueError(f"model: expected float32 and harmonics of degree {plan.config.sh_degree}, got others")
@@ -227,10 +226,11 @@ def digest(tensor: Tensor) -> str:
 
 
 def check_saved(saved: dict[str, Any], scene: dict[str, Any], config: FitConfig, steps: int) -> list[str]:
-    """Raise KeyError, TypeError or ValueError unless a saved fit has this fingerprint and configuration.
+    """Raise KeyError, TypeError or ValueError unless a saved fit has this fingerprint, configuration and plain values.
 
     Returns notes for the user, if a finished fit goes on for more steps.
     """
+    check_plain(saved, *PLAIN)
     planned = saved["config"]["steps"]
     done = saved["step"]
     notes = list[str]()

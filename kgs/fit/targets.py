@@ -32,6 +32,10 @@ class Target(NamedTuple):
         image: Tensor = _AtMostOne.apply(exposed)  # it is never below 0
         return image if self.transmittance is None else image * self.transmittance
 
+    def behind(self, background: Tensor | None) -> Tensor | None:
+        """What to render before, so that :meth:`seen` shows this background, `(3,)`: photos have it unexposed."""
+        return background if self.gains is None or background is None else background / self.gains[:, 0, 0]
+
     def over(self, background: Tensor, backend: str) -> Self:
         """The view before another background, `(3,)`; the backend is that of the loss."""
         if self.clear is None:

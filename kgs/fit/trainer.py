@@ -5,8 +5,10 @@ the same views in the same order.
 """
 
 import math
+import os
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -26,7 +28,7 @@ from kgs.renderer import GaussianRenderer
 from kgs.torch_threads import threads_beside
 from kgs.types import Gaussians, RasterOptions, Rendering, check_kind
 
-from .checkpoint import newest_checkpoint, save_checkpoint
+from .checkpoint import newest_checkpoint, previous, save_checkpoint
 from .config import FitConfig
 from .divergence import bound_scales, gradient_fault, parameter_fault, scale_fault, step_fault
 from .exposure import with_exposure
@@ -211,11 +213,12 @@ class Trainer:
         """
         plan = self.plan
         with state_errors():
-            state = TrainState.from_dict(self._given, plan, values)
             longer = check_saved(values, self._fingerprint, plan.config, plan.times.steps)
             runs = next(x for x in BACKENDS if x.name == values["backend"]).runs_on(plan.device)
             backend = resolve(values["backend"] if runs else "auto", plan.device)
-            self.plan = replace(plan, backend=backend, needs=values["needs"])
+            with_exposure(self._given, values["needs"])  # checks the gains
+            state = TrainState.from_dict(self._given, plan, values)
+        self.plan = replace(plan, backend=backend, needs=values["needs"])
         state.notes += longer
         self._use(state)
 
@@ -238,7 +241,7 @@ class Trainer:
 
     @classmethod
     def resume(cls, scene: Scene, config: FitConfig, path: str | PathLike[str]) -> Self:
-        """Continue from a checkpoint bit for bit. If it is damaged the one before is used, and the notes say so.
+        """Continue from a checkpoint bit for bit. If it is damaged the one before takes its place, as the notes say.
 
         What the configuration leaves open is as it was decided for the checkpoint.
 
@@ -262,6 +265,8 @@ class Trainer:
             raise DataError(path, field, reason) from error
         trainer.saved = f"{path} of step {trainer.step}"
         if damage:
+            with suppress(OSError):  # else the next checkpoint would put the damaged one in place of the whole one
+                os.replace(previous(Path(path)), path)
             trainer.state.note(f"{damage}; went on from the previous checkpoint, of step {trainer.step}")
         return trainer
 
@@ -280,7 +285,7 @@ class Trainer:
         if config.training_background == "random":
             background = torch.rand(3, generator=state.colors, dtype=torch.float32, device=self.plan.device)
             view = view.over(background, self.plan.backend)
-        rendering: Any = self.render_view(state.model(), camera, background)
+        rendering: Any = self.render_view(state.model(), camera, view.behind(background))
         if rendering.projected.means2d.requires_grad:
             rendering.projected.means2d.retain_grad()  # for the densifier
         loss = self.loss_of(view.seen(rendering.image), view)

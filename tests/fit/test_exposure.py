@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from kgs.datasets import synthetic_scene
 from kgs.fit.config import PRESETS, FitConfig
 from kgs.fit.exposure import LEAST_RATIO, decide_exposure, estimate_gains, with_exposure
 from kgs.fit.measures import measure
 from kgs.fit.plan import make_plan
 from kgs.fit.run import choose_points, decide, fit_scene
+from kgs.fit.targets import targets
 from kgs.fit.trainer import Trainer
 from kgs.init_points import InitialPoints, initial_points
 from kgs.init_points.patches import MIN_PATCHES, PatchColors
@@ -144,6 +146,24 @@ def test_gains_of_another_number_of_photos_are_refused(arc):
         with_exposure(arc, {"exposure": {"gains": [[1.0, 1.0, 1.0]]}})
     with pytest.raises(ValueError, match="gains"):
         replace(arc.train, gains=torch.zeros(6, 3))
+
+
+def test_what_is_seen_through_a_photo_has_no_exposure():
+    """A perfect render is its photo, over the background of the scene and over any other."""
+    scene = synthetic_scene(size=(16, 24))
+    draw = torch.Generator().manual_seed(0)
+    alpha = torch.rand(len(scene.train), 1, 16, 24, generator=draw)
+    surface = alpha * (0.2 + 0.5 * torch.rand(3, 16, 24, generator=draw))
+    gain = torch.tensor([0.8, 1.0, 1.25])[:, None, None]
+    for behind in (torch.zeros(3), torch.ones(3)):
+        images = surface * gain + (1 - alpha) * behind[:, None, None]
+        gains = gain[:, 0, 0].repeat(len(images), 1)
+        target = targets(replace(scene.train, images=images, masks=alpha, gains=gains), behind, torch.device("cpu"))[0]
+        for color in (behind, torch.tensor([0.1, 0.6, 0.3])):
+            view = target.over(color, "torch")
+            render = surface[:1] + (1 - alpha[:1]) * view.behind(color)[:, None, None]
+            torch.testing.assert_close(view.seen(render), view.image, atol=1e-6, rtol=0)
+            torch.testing.assert_close(view.image, surface[:1] * gain + (1 - alpha[:1]) * color[:, None, None])
 
 
 def test_recoloured_renders_fit_best():

@@ -140,6 +140,10 @@ def test_a_damaged_checkpoint_falls_back_and_ends_in_the_same_bits(scene: Any, w
     fit_folder(scene, CONFIG, tmp_path, resume=True, lines=lines)
     assert any("went on from the previous checkpoint" in line for line in lines)
     assert (tmp_path / "splat.ply").read_bytes() == (whole / "splat.ply").read_bytes()
+    path.write_bytes(path.read_bytes()[:-7])
+    Trainer.resume(scene, CONFIG, path)  # the whole one is not lost when the next is written
+    assert load_checkpoint(path)["step"] > 0
+    assert not previous(path).exists()
     for damaged in (path, previous(path)):
         damaged.write_bytes(b"")
     with pytest.raises(DataError, match=CHECKPOINT):
