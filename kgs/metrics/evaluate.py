@@ -74,7 +74,7 @@ def evaluate(
 def recolored(image: Tensor, shown: Tensor, photo: Tensor, counted: Tensor | None = None) -> Tensor:
     """A render `(1, 3, H, W)` with the gain and offset of each channel that fit `shown` to the photo `(3, H, W)`.
 
-    `shown` is the render as it is compared with the photo; least squares in float64 over the pixels `(1, H, W)` that
+    `shown` is the render as it is compared with the photo; least squares in float64 over the pixels `(H, W)` that
     are counted, or over all.
     """
     every = slice(None) if counted is None or not bool(counted.any()) else counted.flatten().to(shown.device)
@@ -116,9 +116,10 @@ def measure_again(
     DataError if the views differ.
     """
     fresh: dict[str, Any] = {}
-    if metrics.get("recolored") and len(scene.test):
-        fresh["recolored"] = evaluate(render, scene.test, lpips, recolor=True)
-    for part, views in (("test", scene.test), ("train", scene.train)):
+    parts = [("test", scene.test), ("train", scene.train)]
+    if metrics.get("recolored"):
+        parts.append(("recolored", scene.test))
+    for part, views in parts:
         old = metrics.get(part) or {"views": []}
         try:
             old_rows = {row["name"]: row for row in old["views"]}
@@ -126,7 +127,7 @@ def measure_again(
             raise DataError(path, part, "expected the metrics of a fit, got something else") from error
         if set(old_rows) != set(views.names):
             raise DataError(path, part, f"has other views than the {len(views)} of {scene.root}: fit again")
-        new = evaluate(render, views, lpips) if old_rows else None
+        new = evaluate(render, views, lpips, recolor=part == "recolored") if old_rows else None
         if new is not None and lpips is None:
             _copy_lpips(old, new)
             for row in new["views"]:

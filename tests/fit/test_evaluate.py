@@ -3,13 +3,16 @@
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from factories import random_views
 
-from kgs.metrics.evaluate import BEST, comparable, evaluate, mean_psnr
+from kgs.datasets.scene import Scene
+from kgs.errors import DataError
+from kgs.metrics.evaluate import BEST, comparable, evaluate, mean_psnr, measure_again
 from kgs.metrics.lpips import Lpips
 
 KEYS = {"psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled", "views"}
@@ -105,6 +108,21 @@ def test_lpips_is_measured_in_both_scalings():
     assert result["lpips_vgg"] == pytest.approx(lpips(render, views.images).item())
     assert result["lpips_vgg_unscaled"] == pytest.approx(lpips(render, views.images, rescale=False).item())
     assert result["lpips_vgg"] != pytest.approx(result["lpips_vgg_unscaled"])
+
+
+def test_lpips_that_is_not_measured_again_is_kept():
+    views = random_views()
+    none = torch.zeros(0, 3)
+    scene = Scene(views, views, none, none, "none", torch.zeros(3), torch.zeros(3), Path("scene"))
+    render = renderer_of(distort(views.images).clamp(0, 1))
+    torch.manual_seed(0)
+    lpips = Lpips()
+    measured = [evaluate(render, views, lpips, recolor=recolor) for recolor in (False, True)]
+    metrics = {"test": measured[0], "train": measured[0], "recolored": measured[1], "steps": 3}
+    assert measure_again(Path("metrics.json"), metrics, scene, render, None) == metrics
+    wrong = {**metrics, "recolored": {"views": []}}
+    with pytest.raises(DataError, match="recolored"):
+        measure_again(Path("metrics.json"), wrong, scene, render, None)
 
 
 def test_float64_renders_are_measured():
