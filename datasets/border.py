@@ -1,8 +1,12 @@
 """The dark border that removing a lens's distortion leaves around photos, found from the photos themselves."""
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool1d
+
+from .scene import Views
 
 WIDEST = 0.02  # of the side, at least `FEWEST_LINES` pixels
 FEWEST_LINES = 3
@@ -10,6 +14,14 @@ DARK = 0.8  # share of the brightness farther inside, below which an edge may be
 CLEAR = 0.9  # share of the brightness farther inside, from which on a row is no border
 FAINTEST = 0.05  # brightness next to a border; where it is darker a border cannot be told from the scene
 ALONG = 0.1  # of the side: how far the brightness is averaged along it
+
+
+def with_border(train: Views) -> Views:
+    """The training views with the dark border of their photos, if these are opaque and have one."""
+    has_pixels = train.images.device.type != "meta"
+    if not has_pixels or train.masks is not None:
+        return train
+    return replace(train, transmittance=border_transmittance(train.images))
 
 
 def border_transmittance(images: Tensor) -> Tensor | None:

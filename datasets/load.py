@@ -17,7 +17,7 @@ from torch import Tensor
 
 from kgs.errors import DataError, listed
 
-from .border import border_transmittance
+from .border import with_border
 from .folders import CAMERAS_REPORT
 from .frames import LARGEST, Frame, FrameSet
 from .images import rectification, remap, resize
@@ -121,7 +121,7 @@ def load_scene(
             scales.append(_Scale.of(first, fine_downscale))
         absent = mask_means == "absent"
         make_views = partial(_views, offset=offset, background=color, photos=photos, absent=absent)
-        train_per_scale = [_with_border(views) for views in make_views(train, scales)]
+        train_per_scale = [with_border(views) for views in make_views(train, scales)]
         at_size = train_per_scale[0]
         (test_views,) = make_views(test, scales[:1])
         notes = (*frame_set.notes, *_mask_notes([*train, *test], at_size, absent))
@@ -160,14 +160,6 @@ def _mask_notes(frames: Sequence[Frame], train: Views, absent: bool) -> list[str
     share = "" if train.counted is None else f", {1 - float(train.counted.float().mean()):.0%} of the training pixels"
     meaning = "treated as empty" if absent else f"ignored{share}"
     return [f"masks of {masked} of {len(frames)} photos: black pixels are {meaning}"]
-
-
-def _with_border(train: Views) -> Views:
-    """The training views with the dark border of their photos, if these are opaque and have one."""
-    has_pixels = train.images.device.type != "meta"
-    if not has_pixels or train.masks is not None:
-        return train
-    return replace(train, transmittance=border_transmittance(train.images))
 
 
 def _split(

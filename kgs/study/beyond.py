@@ -20,6 +20,7 @@ from torch import Tensor
 
 from kgs.bench.scenes import check_scenes
 from kgs.datasets import load_scene, synthetic_scene
+from kgs.datasets.border import with_border
 from kgs.datasets.scene import Scene, Views
 from kgs.datasets.synthetic import synthetic_depths, views_beyond
 from kgs.errors import DataError
@@ -159,10 +160,11 @@ def from_the_middle(scene: Scene, count: int) -> Scene:
     centers = camera_centers(views.cameras.extrinsics).double()
     order = (centers - centers.mean(dim=0)).norm(dim=1).argsort(stable=True).tolist()
     held_out = min(ceil(OUTER * len(order)), len(order) - count)
-    train = sorted(order[:count])
-    test = sorted(order[len(order) - held_out :])
-    finer = None if scene.finer is None else scene.finer.select(train)
-    return replace(scene, train=views.select(train), test=views.select(test), finer=finer)
+    middle = sorted(order[:count])
+    train = with_border(views.select(middle))  # that of all photos would depend on those held out
+    test = replace(views.select(sorted(order[len(order) - held_out :])), transmittance=train.transmittance)
+    finer = None if scene.finer is None else with_border(scene.finer.select(middle))
+    return replace(scene, train=train, test=test, finer=finer)
 
 
 @lru_cache(maxsize=1)

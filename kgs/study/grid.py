@@ -152,8 +152,8 @@ def _threads(client: Client) -> int:
 
 
 def _append(path: Path, row: dict[str, Any]) -> None:
-    with path.open("a", encoding="utf-8") as file:
-        file.write(_key(row) + "\n")
+    with path.open("ab") as file:
+        file.write(_key(row).encode() + b"\n")
         file.flush()
         os.fsync(file.fileno())
 
@@ -211,22 +211,27 @@ def read_rows(path: Path, *, repair: bool = False) -> list[dict[str, Any]]:
         repair: also remove a last line that was cut short from the file.
 
     Raises:
-        ValueError: another line is not JSON.
+        ValueError: another line is not JSON, or a line is not that of a cell.
     """
-    lines = path.read_bytes().splitlines() if path.exists() else []
+    lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
     rows = []
     for number, line in enumerate(lines, 1):
         try:
-            rows.append(json.loads(line))
+            row = json.loads(line)
         except ValueError as error:
             if number < len(lines):
                 raise ValueError(
                     f"{path}: line {number}: expected JSON, got an error of its parser: {error}"
                 ) from error
+            break
+        if not isinstance(row, dict) or not isinstance(row.get("cell"), dict):
+            raise ValueError(f"{path}: line {number}: expected a cell and its result, got {line[:60]!r}")
+        rows.append(row)
     if repair and lines:
         with path.open("r+b") as file:
-            file.seek(max(0, sum(len(line) + 1 for line in lines[: len(rows)]) - 1))
-            file.write(b"\n" if rows else b"")
+            whole = b"".join(lines[: len(rows)])
+            file.seek(len(whole))
+            file.write(b"\n" if rows and not whole.endswith(b"\n") else b"")
             file.truncate()
     return rows
 

@@ -49,7 +49,9 @@ def coadaptation(
 
 
 def count_over_threshold(trainer: Trainer, initial_points: Tensor) -> dict[str, Any]:
-    """Count Gaussians, and those whose mean gradient since the last densification is over the threshold, by distance.
+    """Count Gaussians, and those whose mean gradient is over the threshold of densification, by distance.
+
+    The mean is :attr:`kgs.densify.Densifier.mean_gradients`.
 
     The distance is that to the nearest training camera, in medians of the initial points' distances. The edges of the
     bins are quantiles of these; what lies beyond counts in the outer bins. Source: the DropGaussian paper.

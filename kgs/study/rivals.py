@@ -98,8 +98,8 @@ class SelectiveDrop(DropGaussian):
 def gaussian_scores(by: str, densifier: Densifier, camera: PinholeCamera) -> Tensor:
     """A number for each Gaussian, `(N,)`, the highest for those that `by` is about.
 
-    "high-gradient" or "low-gradient": the mean gradient of the projected centre since the last densification. "far" or
-    "near": the distance from the camera's centre, in world units.
+    "high-gradient" or "low-gradient": :attr:`kgs.densify.Densifier.mean_gradients`. "far" or "near": the distance from
+    the camera's centre, in world units.
     """
     if by.endswith("gradient"):
         scores = densifier.mean_gradients

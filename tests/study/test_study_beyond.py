@@ -122,6 +122,21 @@ def test_real_scenes_are_trained_from_the_middle_and_tested_outside(tmp_path):
     assert len(from_the_middle(whole, 7).test) == 1
 
 
+def test_a_border_is_that_of_the_photos_in_the_middle(tmp_path):
+    extrinsics = torch.eye(4).repeat(8, 1, 1)
+    extrinsics[:, 0, 3] = torch.arange(8.0)
+    photos = torch.full((8, 3, 200, 40), 0.6)
+    photos[2:5, :, 0] = 0.3
+    views = as_views(pinholes(torch.eye(4).repeat(8, 1, 1), extrinsics, (200, 40)), photos)
+    none = torch.zeros(0, 3)
+    whole = Scene(views, views.select([]), none, none, "none", torch.zeros(3), torch.zeros(3), tmp_path)
+    scene = from_the_middle(whole, 3)
+    for part in (scene.train, scene.test):
+        assert part.transmittance is not None
+        torch.testing.assert_close(part.transmittance[0], torch.full((40,), 0.5))
+        assert float(part.transmittance[1:].min()) == 1.0
+
+
 def test_cells_are_there_once_the_synthetic_ones_first(tmp_path):
     alone = beyond_cells(None)
     assert {cell["scene"] for cell in alone} == {*beyond.WORLDS}

@@ -27,6 +27,12 @@ def damaged_lines(folder):
     read_rows(path)
 
 
+def lines_of_others(folder):
+    path = folder / "g.jsonl"
+    path.write_text('{"cell": {}, "result": {}}\n{"step": 1}\n')
+    read_rows(path)
+
+
 def scores_of_shape(*shape):
     drop = SelectiveDrop(0.2, "constant")
     drop.scores = torch.zeros(shape)
@@ -51,6 +57,7 @@ CASES = [
     ("cells", ValueError, lambda folder: run_grid([{"x": 1}, {"x": 1}], json.dumps, folder / "g.jsonl")),
     ("processes", ValueError, lambda folder: run_grid([{"x": 1}], json.dumps, folder / "g.jsonl", processes=0)),
     ("FOLDER/g.jsonl: line 1", ValueError, damaged_lines),
+    ("FOLDER/g.jsonl: line 2", ValueError, lines_of_others),
     ("subsets", ValueError, lambda _: coadaptation(None, None, subsets=1)),
     ("rows", ValueError, lambda _: cells_frame([])),
     ("rows", ValueError, lambda _: cells_frame([ROW, ROW])),

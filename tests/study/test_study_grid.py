@@ -84,6 +84,18 @@ def test_a_whole_last_line_without_its_end_is_kept(tmp_path, threads):
     assert len(path.read_text().splitlines()) == 2
 
 
+def test_lines_that_end_as_on_windows_are_whole(tmp_path, threads):
+    path = tmp_path / "g.jsonl"
+    run_grid(CELLS, square, path, scheduler=threads, say=quiet)
+    content = path.read_bytes().replace(b"\n", b"\r\n")
+    for end in (0, 9):
+        path.write_bytes(content[: len(content) - end])
+        rows = run_grid(CELLS, square, path, scheduler=threads, say=quiet)
+        assert [row["result"]["y"] for row in rows] == [x**2 for x in range(6)]
+        assert len(path.read_bytes().splitlines()) == 6
+        assert path.read_bytes().startswith(content[: -9 * len(CELLS)])
+
+
 def test_a_file_belongs_to_one_run_at_a_time(tmp_path, threads):
     path, refused = tmp_path / "rows.jsonl", []
 
