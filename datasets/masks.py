@@ -57,7 +57,7 @@ def find_masks(photos: Sequence[Path], folder: Path | None) -> dict[Path, Mask]:
     """The masks of photos: those in a folder, and instant-ngp's beside photos that have none there.
 
     Raises:
-        DataError: the folder does not exist, or holds no masks, or one that fits no photo or several.
+        DataError: the folder does not exist, or holds no masks, one that fits no photo or several, or two that fit one.
     """
     found = {photo: Mask(ImageFile(beside), keeps_white=False) for photo in photos if (beside := _dynamic(photo))}
     if folder is None:
@@ -68,14 +68,18 @@ def find_masks(photos: Sequence[Path], folder: Path | None) -> dict[Path, Mask]:
     if not masks:
         raise DataError(folder, "", "expected masks, pictures with the stems of the photos, found none")
     folders = [place for place in {photo.parent for photo in photos} if place.is_dir()]
+    named: dict[Path, Path] = {}
     for mask in masks:
         fitting = [photo for photo in photos if _fits(mask, photo)]
         if len(fitting) > 1:
             raise DataError(mask, "", f"expected a mask of one photo, it fits {fitting[0]} and {fitting[1]}")
         if not fitting and not any(_fits(mask, photo) for place in folders for photo in list_images(place)):
             raise DataError(mask, "", "fits no photo: expected the stem of one, as IMG_1.png for IMG_1.jpg")
-        found.update((photo, Mask(ImageFile(mask))) for photo in fitting)
-    return found
+        for photo in fitting:
+            if photo in named:
+                raise DataError(mask, "", f"expected one mask of {photo.name}, got {named[photo].name} too")
+            named[photo] = mask
+    return found | {photo: Mask(ImageFile(mask)) for photo, mask in named.items()}
 
 
 def _fits(mask: Path, photo: Path) -> bool:

@@ -162,6 +162,14 @@ def test_a_stem_that_two_photos_have_is_no_mask_of_one(tmp_path: Path) -> None:
         load_scene(tmp_path)
 
 
+def test_two_masks_of_a_photo_are_named(tmp_path: Path) -> None:
+    write_llff(tmp_path)
+    write_mask(tmp_path / "masks" / "0.png")
+    write_mask(tmp_path / "masks" / "0.jpg")
+    with pytest.raises(DataError, match=r"masks/0.*: expected one mask of 0\.[a-z]+, got 0\.jpg too"):
+        load_scene(tmp_path)
+
+
 def test_a_mask_of_a_photo_that_is_not_in_the_model_is_no_error(tmp_path: Path) -> None:
     write_colmap(tmp_path)
     cv2.imwrite(str(tmp_path / "images" / "not registered.png"), LEFT)
