@@ -122,7 +122,10 @@ def initial_points(
     near, far = depth_range(tracked, geometry)
     points = _random_points(geometry, count, near, far, generator)
     places, depths = geometry.project(points)
-    colors = _mean_colors(views.images, places, geometry.inside_images(places, depths, near, far))
+    inside = geometry.inside_images(places, depths, near, far)
+    if views.usable is not None:
+        inside &= _values_at(views.usable.cpu().float()[:, None], places)[..., 0] > 0.5
+    colors = _mean_colors(views.images, places, inside)
     return InitialPoints(points.float(), colors, "random")
 
 
@@ -145,9 +148,14 @@ def _random_points(geometry: ViewGeometry, count: int, near: float, far: float, 
 
 def _mean_colors(images: Tensor, pixels: Tensor, visible: Tensor) -> Tensor:
     """The mean of the images' colours at pixels `(P, V, 2)`, over the views where `visible` `(P, V)`."""
-    images = images.cpu()
+    samples = _values_at(images.cpu(), pixels)
+    weights = (visible / visible.sum(1, keepdim=True))[..., None].to(samples)
+    return torch.where(weights > 0, weights * samples, 0.0).sum(1).clamp(0.0, 1.0)
+
+
+def _values_at(images: Tensor, pixels: Tensor) -> Tensor:
+    """The values of images `(V, K, H, W)` at places `(P, V, 2)` in pixels, bilinearly interpolated, `(P, V, K)`."""
     span = torch.tensor([max(images.shape[-1] - 1, 1), max(images.shape[-2] - 1, 1)])
     grid = (2.0 * pixels / span - 1.0).transpose(0, 1)[:, :, None].to(images.dtype)
-    samples = torch.nn.functional.grid_sample(images, grid, padding_mode="border", align_corners=True)[..., 0]
-    weights = (visible / visible.sum(1, keepdim=True)).T[:, None].to(images.dtype)
-    return torch.where(weights > 0, weights * samples, 0.0).sum(0).T.clamp(0.0, 1.0).contiguous()
+    samples = torch.nn.functional.grid_sample(images, grid, padding_mode="border", align_corners=True)
+    return samples[..., 0].permute(2, 0, 1)

@@ -104,7 +104,7 @@ def agreed_depths(
     views: Views, near: float, far: float, bar: ProgressBar = silent, backend: str = "auto"
 ) -> tuple[list[DepthMap], list[Tensor]]:
     """The depth maps of the views, averaged, and the pixels that count: inside, usable and well matched."""
-    maps = sweep_depths(views, near, far, bar, backend, to_infinity=True)
+    maps = sweep_depths(views, near, far, bar, backend)
     certain = [depth_map.is_inner & (depth_map.scores > SCORE) for depth_map in maps]
     if views.usable is not None:
         certain = [mask & usable for mask, usable in zip(certain, views.usable.cpu(), strict=True)]

@@ -40,14 +40,12 @@ def sweep_depths(
     far: float,
     bar: ProgressBar = silent,
     backend: str = "auto",
-    *,
-    to_infinity: bool = False,
 ) -> list[DepthMap]:
-    """The depth map of each view, from planes evenly spread over inverse depth, between two depths.
+    """The depth map of each view, from planes evenly spread over inverse depth, from a depth to infinity.
 
-    With `to_infinity` planes go on beyond `far`, equally spaced, until one lies beyond infinity: an inverse depth below
-    0, so that infinity is not the last plane. There are at most `MOST_TO_INFINITY`, else farther apart. Depths are at
-    most `FARTHEST` times `far`.
+    Planes are as far apart as the scene asks for between `near` and `far`. Beyond `far` they go on until one lies
+    beyond infinity: an inverse depth below 0, so that infinity is not the last plane. There are at most
+    `MOST_TO_INFINITY`, else farther apart. Depths are at most `FARTHEST` times `far`.
 
     If all other views are at the place of a view, its depths are unknown and its scores -1.
     """
@@ -55,11 +53,9 @@ def sweep_depths(
         raise ValueError(f"near, far: expected 0 < near < far, got {near} and {far}")
     grey = rgb_to_grayscale(views.images.cpu().float())[:, 0]
     planes = plane_count(planes_wanted(views, near, far))
-    inverse = torch.linspace(1 / near, 1 / far, planes, dtype=torch.float64)
-    typical = 1 / float(inverse.mean())
-    if to_infinity:
-        spacing = max((1 / near - 1 / far) / (planes - 1), 1 / near / (MOST_TO_INFINITY - 2))
-        inverse = 1 / near - spacing * torch.arange(math.ceil(1 / near / spacing) + 2, dtype=torch.float64)
+    typical = 2 / (1 / near + 1 / far)
+    spacing = max((1 / near - 1 / far) / (planes - 1), 1 / near / (MOST_TO_INFINITY - 2))
+    inverse = 1 / near - spacing * torch.arange(math.ceil(1 / near / spacing) + 2, dtype=torch.float64)
     geometry = ViewGeometry.of(views.cameras)
     memory = torch.empty(2, *grey.shape[1:], len(inverse))
     maps = []

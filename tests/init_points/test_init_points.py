@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -111,6 +112,19 @@ def test_random_points_lie_in_two_views_at_the_depths_of_sift_points(planes: Vie
     depths = result.points[:, 2]
     sift = sift_points.points[:, 2]
     assert 0.7 * float(sift.min()) < float(depths.min()) < float(depths.max()) < 1.6 * float(sift.max())
+
+
+def test_random_points_have_the_colours_of_what_counts() -> None:
+    views = flat()
+    counted = torch.ones(views.images[:, 0].shape, dtype=torch.bool)
+    counted[..., : counted.shape[-1] // 2] = False
+    shown = replace(views, images=views.images * counted[:, None], counted=counted)
+    colors = initial_points(shown, "random", count=500).colors
+    black = (colors == 0).all(1)  # seen where no pixel counts
+    assert 0.05 < float(black.float().mean()) < 0.6
+    # a place may lie between pixels that count and others
+    assert float((colors[~black] - torch.tensor([0.2, 0.4, 0.6])).abs().amax(1).median()) < 1e-6
+    assert float(colors[~black].amin(0)[0]) > 0.1
 
 
 def test_random_points_depend_on_the_seed_alone() -> None:

@@ -14,7 +14,6 @@ from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
 from kgs.geometry import ViewGeometry, camera_centers, nearest_pixels, project_points
 from kgs.init_points import dense, initial_points
-from kgs.init_points.agreement import AGREEMENT
 from kgs.init_points.dense import PER_SKY, SKY, _one_per_cell, dense_points, small_enough
 from kgs.init_points.depth_limits import MIN_SIFT, sweep_range
 from kgs.init_points.plane_sweep import FARTHEST, _neighbours, plane_count, planes_wanted, sweep_depths
@@ -266,13 +265,11 @@ def test_points_of_the_sky_are_as_good_as_infinitely_far_away(before_a_sky) -> N
 
 
 @pytest.mark.slow
-def test_a_sweep_to_infinity_finds_the_same_depths_where_there_is_no_sky(views: Views, span) -> None:
+def test_where_there_is_no_sky_no_point_is_far_away(views: Views, span) -> None:
     small = views.halved()
-    for to, until in zip(sweep_depths(small, *span, to_infinity=True), sweep_depths(small, *span), strict=True):
-        certain = until.is_inner & (until.scores > 0.6)
-        assert float(((to.depths / until.depths - 1).abs()[certain] < AGREEMENT).double().mean()) > 0.995
-        assert float(to.depths.max()) <= 1.001 * FARTHEST * span[1]
-        assert float(to.depths.min()) > 0
+    for found in sweep_depths(small, *span):
+        assert float(found.depths.max()) <= 1.001 * FARTHEST * span[1]
+        assert float(found.depths.min()) > 0
     points, *_ = dense_points(small, *span, 2000, generator())
     assert float((project_points(points, views.cameras)[1] > 1.5 * span[1]).double().mean()) < 0.005
 
