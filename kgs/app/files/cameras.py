@@ -33,8 +33,8 @@ def camera_list(views: Sequence[Views], offset: Tensor, means: Tensor) -> list[d
 
     Returns:
         One dict per view: id (counted from 0), img_name, width, height, fx and fy (pixels), position (world units),
-        rotation, bounds (two opposite corners of a box, in world units; beyond each of its sides lies a hundredth of
-        the centres that are not in a sky; not without Gaussians), and generator, the version of kgs that wrote it.
+        rotation, and bounds (two opposite corners of a box, in world units; beyond each of its sides lies a hundredth
+        of the centres that are not in a sky; not without Gaussians).
     """
     box = {"bounds": _bounds(means, offset)} if len(means) else {}
     entries = list[dict[str, Any]]()
