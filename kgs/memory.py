@@ -5,6 +5,7 @@ did it at once. A block is free again when the last array in it is gone.
 """
 
 import math
+import os
 import weakref
 from threading import Lock
 from typing import Any
@@ -21,6 +22,8 @@ _WASTE = 1.5  # a block may be so many times larger than what is wanted
 _MARGIN = 1.1  # new blocks are larger than asked for, because the number of Gaussians grows
 _free: list[np.ndarray[Any, Any]] = []
 _lock = Lock()
+if hasattr(os, "register_at_fork"):  # the child of a fork has no thread that could release it
+    os.register_at_fork(before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_lock.release)
 
 
 def array(shape: int | tuple[int, ...], dtype: Any = np.float32) -> np.ndarray[Any, Any]:

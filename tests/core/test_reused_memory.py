@@ -1,5 +1,7 @@
 """Memory that is used again."""
 
+import os
+import signal
 import threading
 
 import numpy as np
@@ -81,3 +83,24 @@ def test_what_is_kept_is_bounded(monkeypatch):
     arrays = [array(LARGE) for _ in range(10)]
     del arrays
     assert 0 < sum(map(len, kgs.memory._free)) <= 2**20
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_child_forked_while_a_thread_takes_memory_can_take_some():
+    taken = threading.Event()
+
+    def take():
+        with kgs.memory._lock:
+            taken.set()
+            threading.Event().wait(0.2)
+
+    thread = threading.Thread(target=take)
+    thread.start()
+    taken.wait()
+    child = os.fork()
+    if child == 0:
+        signal.alarm(20)
+        array(LARGE)
+        os._exit(0)
+    thread.join()
+    assert os.waitpid(child, 0)[1] == 0
