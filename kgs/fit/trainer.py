@@ -151,13 +151,16 @@ class Trainer:
         Raises:
             TrainingDiverged: see :meth:`fit`.
             ValueError: all steps of the plan are done.
+            RuntimeError: within `torch.inference_mode`, where there are no gradients.
         """
+        if torch.is_inference_mode_enabled():
+            raise RuntimeError("train_step: expected no torch.inference_mode, in which there are no gradients")
         state = self.state
         times = self.plan.times
         if state.step >= times.steps:
             raise ValueError(f"steps: expected a step of {times.steps} to be left, got none")
         start = time.perf_counter()
-        with threads_beside(self.plan.backend):
+        with threads_beside(self.plan.backend), torch.enable_grad():
             loss = self._descend()
         state.seconds += time.perf_counter() - start
         if state.step in times.evaluate:  # before densifying: right after it the image is 2 dB worse for a while

@@ -173,6 +173,18 @@ def test_the_usual_limit_is_reached_without_a_word(whole, points):
     assert whole.state.notes == []
 
 
+def test_a_fit_has_gradients_where_they_are_switched_off_around_it(scene, points):
+    trainer, same = begun(scene, points), begun(scene, points)
+    with torch.no_grad():
+        losses = [trainer.train_step() for _ in range(3)]
+    assert [same.train_step() for _ in range(3)] == losses
+    for name, value in parameters(same).items():
+        assert torch.equal(parameters(trainer)[name], value)
+    with torch.inference_mode(), pytest.raises(RuntimeError, match="inference_mode"):
+        trainer.train_step()
+    assert trainer.step == 3
+
+
 PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh_dc")
 
 
