@@ -103,7 +103,7 @@ class GaussianRenderer(nn.Module):
             ValueError: an unknown output, shapes that do not fit, `max_bytes` too small for a row of tiles, or the
                 backend that is named does not cover the call.
         """
-        if isinstance(outputs, str) or not outputs or set(outputs) - set(_OUTPUTS):
+        if isinstance(outputs, str) or not (outputs := tuple(outputs)) or set(outputs) - set(_OUTPUTS):
             raise ValueError(f"outputs: expected some of {_OUTPUTS}, got {outputs!r}")
         check_kind("gaussians", gaussians, Gaussians)
         opacities = self.opacity_layer(gaussians.opacities)
@@ -173,6 +173,8 @@ class _OverColor(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        if torch.is_grad_enabled():
+            raise RuntimeError("background: expected backward without create_graph, there is no second derivative")
         (color,) = ctx.saved_tensors
         by_transmittance = None
         if ctx.needs_input_grad[1]:

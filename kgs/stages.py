@@ -2,6 +2,7 @@
 
 import functools
 import math
+import weakref
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, TypeVar
@@ -162,7 +163,7 @@ def composite(
 def composite_call(
     call: CompositingCall, backend: str = "auto", absgrad_hook: Callable[[Tensor], None] | None = None
 ) -> Composited:
-    """:func:`composite`; a hook takes the absolute gradients `(M, 2)`, and `means2d.absgrad` is not set."""
+    """:func:`composite`; a hook takes the absolute gradients `(M, 2)` instead of `means2d.absgrad`."""
     _check_projected(call.projected, call.features)
 
     def covers(candidate: Backend) -> bool:
@@ -174,8 +175,20 @@ def composite_call(
     projected = call.projected
     inputs = (projected.means2d, projected.factors, projected.opacities, call.features)
     keep = torch.is_grad_enabled() and any(x.requires_grad for x in inputs)
-    sums, transmittance, median = _Composite.apply(*inputs, chosen.compositor(call), keep, absgrad_hook)
+    hook = _setter(projected.means2d) if absgrad_hook is None else absgrad_hook
+    sums, transmittance, median = _Composite.apply(*inputs, chosen.compositor(call), keep, hook)
     return Composited(sums, transmittance, median if call.median_depth else None, tile_size)
+
+
+def _setter(means2d: Tensor) -> Callable[[Tensor], None]:
+    """Sets `absgrad` of this very tensor, which graphs with hooks on saved tensors give back as another."""
+    given = weakref.ref(means2d)  # the tensor has a graph that has this function
+
+    def set_absgrad(absgrad: Tensor) -> None:
+        if (tensor := given()) is not None:
+            tensor.absgrad = absgrad  # type: ignore[attr-defined]
+
+    return set_absgrad
 
 
 def _check_projected(projected: ProjectedGaussians, features: Tensor) -> None:
@@ -193,8 +206,10 @@ def _check_projected(projected: ProjectedGaussians, features: Tensor) -> None:
         if tuple(value.shape) != tuple(shapes[name]):
             raise ValueError(f"{name}: expected shape {shapes[name]}, got {tuple(value.shape)}")
     ids = projected.camera_ids
-    if ids.dtype != torch.int64 or ids.device != like.device or tuple(ids.shape) != (m,):
+    if ids.dtype != torch.int64 or ids.device != like.device:
         raise TypeError(f"camera_ids: expected int64 on {like.device}, got {ids.dtype} on {ids.device}")
+    if tuple(ids.shape) != (m,):
+        raise ValueError(f"camera_ids: expected shape {(m,)}, got {tuple(ids.shape)}")
     if m and ids.device.type == "cpu" and not torch.compiler.is_compiling():  # on a GPU this would synchronise
         first = int(np.min(ids.numpy()))
         last = int(np.max(ids.numpy()))
@@ -215,7 +230,7 @@ class _Composite(torch.autograd.Function):
         features: Tensor,
         compositor: Compositor,
         keep: bool,
-        absgrad_hook: Callable[[Tensor], None] | None,
+        absgrad_hook: Callable[[Tensor], None],
     ) -> tuple[Tensor, Tensor, Tensor]:
         inputs = CompositingInputs(means2d, factors, opacities, features)
         images, ctx.kept = compositor.forward(inputs, keep)
@@ -233,10 +248,8 @@ class _Composite(torch.autograd.Function):
         inputs = CompositingInputs(*ctx.saved_tensors)
         # the state is freed after its first use; a second backward pass computes it again
         gradients, absgrad = ctx.compositor.backward(inputs, _take(ctx), grad_sums, grad_transmittance, needs)
-        if absgrad is not None and ctx.absgrad_hook is not None:
+        if absgrad is not None:
             ctx.absgrad_hook(absgrad)
-        elif absgrad is not None:
-            inputs.means2d.absgrad = absgrad  # type: ignore[attr-defined]  # the tensor that was given, not a copy
         return *gradients, None, None, None
 
 

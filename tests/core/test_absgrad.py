@@ -93,3 +93,23 @@ def test_the_renderer_leaves_them_for_the_densifier():
         densifier.observe(out.projected)
     assert (absolute.mean_gradients >= usual.mean_gradients - 1e-6).all()
     assert absolute.mean_gradients.sum() > 1.1 * usual.mean_gradients.sum()
+
+
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+def test_graphs_that_keep_their_tensors_elsewhere_have_them_too(backend):
+    projected, features, grads = (scene(torch.float32)[i] for i in range(3))
+    plain, image = drawn(projected, features, backend, absgrad=True)
+    image.backward(grads)
+    with torch.autograd.graph.save_on_cpu():
+        saved, image = drawn(projected, features, backend, absgrad=True)
+        image.backward(grads)
+    assert torch.equal(saved.absgrad, plain.absgrad)
+    again = []
+
+    def draw():
+        centres, image = drawn(projected, features, backend, absgrad=True)
+        again.append(centres)
+        return image
+
+    torch.utils.checkpoint.checkpoint(draw, use_reentrant=False).backward(grads)
+    assert torch.equal(again[0].absgrad, plain.absgrad)

@@ -40,9 +40,9 @@ def test_tensors_decide_the_device_whatever_the_default_is(kind):
 def test_transforms_of_functions_are_errors():
     gaussians, camera = random_gaussians(5, 0), random_camera(8, 8, 0)
 
-    def loss(opacities):
+    def loss(opacities, background=None):
         given = Gaussians(gaussians.means, gaussians.quats, gaussians.scales, opacities, gaussians.colors)
-        return GaussianRenderer()(given, camera).image.sum()
+        return GaussianRenderer()(given, camera, background).image.square().sum()
 
     with pytest.raises(RuntimeError):
         torch.func.vmap(loss)(gaussians.opacities[None])
@@ -52,5 +52,6 @@ def test_transforms_of_functions_are_errors():
     value = loss(leaf)
     with pytest.raises(RuntimeError):
         torch.autograd.grad(value, leaf, torch.ones(3).double(), is_grads_batched=True)
-    with pytest.raises(RuntimeError, match="second derivative"):
-        torch.autograd.grad(loss(leaf), leaf, create_graph=True)
+    for background in (None, torch.ones(3).double()):
+        with pytest.raises(RuntimeError, match="second derivative"):
+            torch.autograd.grad(loss(leaf, background), leaf, create_graph=True)
