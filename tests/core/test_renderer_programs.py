@@ -1,5 +1,7 @@
 """The renderer inside other people's programs: compilers, other defaults, transforms of functions."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from factories import FIELDS, OUTPUTS, leaves, other_defaults, posed, random_camera, random_gaussians
@@ -55,3 +57,15 @@ def test_transforms_of_functions_are_errors():
     for background in (None, torch.ones(3).double()):
         with pytest.raises(RuntimeError, match="second derivative"):
             torch.autograd.grad(loss(leaf, background), leaf, create_graph=True)
+
+
+@pytest.mark.usefixtures("each_backend")
+@pytest.mark.parametrize("transform", [torch.func.grad, torch.func.jacrev])
+def test_transforms_are_named(transform):
+    gaussians, camera = random_gaussians(5, 0).to(torch.float32), random_camera(8, 8, 0, torch.float32)
+
+    def loss(colors):
+        return GaussianRenderer()(replace(gaussians, colors=colors), camera).image.sum()
+
+    with pytest.raises(RuntimeError, match="transform"):
+        transform(loss)(gaussians.colors)
