@@ -147,7 +147,7 @@ def _with_masks(root: Path, frame_set: FrameSet, folder: Path | None) -> FrameSe
     if folder is None and any(frame.mask for frames in parts for frame in frames):
         return frame_set
     photos = [frame.path for frames in parts for frame in frames]
-    found = find_masks(photos, mask_folder(root) if folder is None else folder)
+    found = find_masks(photos, mask_folder(root, photos) if folder is None else folder)
     frames, test = ([replace(frame, mask=found.get(frame.path)) for frame in frames] for frames in parts)
     return replace(frame_set, frames=frames, test=None if frame_set.test is None else test)
 
@@ -176,6 +176,8 @@ def _split(
             raise DataError(frame.source, frame.name, f"expected each image once, it is there {where}")
     if frame_set.test is None or hold_out is not None:
         frames = [*frames, *test_frames]
+        if not frames:
+            raise DataError(root, "", "expected posed images, got none")
         every = TEST_EVERY if hold_out is None else hold_out
         if len(frames) < 2 and every:
             raise DataError(root, "", f"expected at least 2 posed images, one of them to test on, got {len(frames)}")

@@ -1,7 +1,8 @@
 """Masks of photos: pictures beside them that say which pixels are kept.
 
 A mask has the photo's stem (or its whole name before the ending, as COLMAP writes them) and lies in `masks/`, in a
-folder that the user names, or where a layout's file says. White is kept. instant-ngp's `dynamic_mask_*.png` beside the
+folder that the user names, or where a layout's file says; masks of photos in subfolders also in subfolders of the same
+names. White is kept. instant-ngp's `dynamic_mask_*.png` beside the
 photos are the other way round: what is not black there moves, and is not kept.
 
 Sources: https://docs.nerf.studio/quickstart/data_conventions.html (masks); instant-ngp, docs/nerf_dataset_tips.md.
@@ -47,10 +48,11 @@ class Mask(NamedTuple):
         return np.asarray(cv2.resize(kept, (width, height), interpolation=cv2.INTER_AREA), np.float32)
 
 
-def mask_folder(root: Path) -> Path | None:
-    """The folder of masks beside a scene's photos, None if there is none with a picture in it."""
-    folders = (root / name for name in MASK_FOLDERS if (root / name).is_dir())
-    return next((folder for folder in folders if list_images(folder)), None)
+def mask_folder(root: Path, photos: Sequence[Path]) -> Path | None:
+    """The folder of masks beside a scene's photos or their folder, None if there is none with a picture in it."""
+    places = dict.fromkeys([root, *sorted({photo.parent for photo in photos})])
+    folders = (place / name for place in places for name in MASK_FOLDERS if (place / name).is_dir())
+    return next((folder for folder in folders if _pictures(folder, photos)), None)
 
 
 def find_masks(photos: Sequence[Path], folder: Path | None) -> dict[Path, Mask]:
@@ -64,16 +66,16 @@ def find_masks(photos: Sequence[Path], folder: Path | None) -> dict[Path, Mask]:
         return found
     if not folder.is_dir():
         raise DataError(folder, "", "expected a folder of masks, found no such folder")
-    masks = list_images(folder)
+    masks = _pictures(folder, photos)
     if not masks:
         raise DataError(folder, "", "expected masks, pictures with the stems of the photos, found none")
     folders = [place for place in {photo.parent for photo in photos} if place.is_dir()]
     named: dict[Path, Path] = {}
     for mask in masks:
-        fitting = [photo for photo in photos if _fits(mask, photo)]
+        fitting = [photo for photo in photos if _fits(mask, photo, folder)]
         if len(fitting) > 1:
             raise DataError(mask, "", f"expected a mask of one photo, it fits {fitting[0]} and {fitting[1]}")
-        if not fitting and not any(_fits(mask, photo) for place in folders for photo in list_images(place)):
+        if not fitting and not any(_fits(mask, photo, folder) for place in folders for photo in list_images(place)):
             raise DataError(mask, "", "fits no photo: expected the stem of one, as IMG_1.png for IMG_1.jpg")
         for photo in fitting:
             if photo in named:
@@ -82,8 +84,18 @@ def find_masks(photos: Sequence[Path], folder: Path | None) -> dict[Path, Mask]:
     return found | {photo: Mask(ImageFile(mask)) for photo, mask in named.items()}
 
 
-def _fits(mask: Path, photo: Path) -> bool:
-    return mask.stem.lower() in (photo.stem.lower(), photo.name.lower())
+def _pictures(folder: Path, photos: Sequence[Path]) -> list[Path]:
+    """The masks of a folder, and of folders in it that have the names of the photos' folders."""
+    parts = {photo.parent.parts for photo in photos}
+    inner = {Path(*names[-depth:]) for names in parts for depth in (1, 2) if len(names) > depth}
+    places = [folder, *sorted(folder / names for names in inner if (folder / names).is_dir())]
+    return [mask for place in places for mask in list_images(place)]
+
+
+def _fits(mask: Path, photo: Path, folder: Path) -> bool:
+    inner = mask.parent.relative_to(folder).parts
+    is_there = photo.parent.parts[len(photo.parent.parts) - len(inner) :] == inner
+    return is_there and mask.stem.lower() in (photo.stem.lower(), photo.name.lower())
 
 
 def _dynamic(photo: Path) -> Path | None:

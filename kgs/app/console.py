@@ -1,10 +1,12 @@
 """Lines and progress bars on the console. A closed pipe never aborts a fit."""
 
+import os
 import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any, TextIO
 
 from kgs.errors import printable
@@ -32,14 +34,26 @@ def say_next(*steps: str) -> None:
 
 def as_line(*words: object) -> str:
     """Words quoted for a shell, on one line."""
-    return " ".join(_quoted(str(word)) for word in words)
+    return " ".join(_quoted(_argument(word)) for word in words)
+
+
+def _argument(word: object) -> str:
+    """The word; a path that begins with a dash is no option."""
+    return f"./{word}" if isinstance(word, Path) and str(word).startswith("-") else str(word)
 
 
 def _quoted(word: str) -> str:
     if word.isprintable():
         return shlex.quote(word)
     escaped = word.replace("\\", "\\\\").replace("'", "\\'")
-    return f"$'{printable(escaped)}'"
+    return f"$'{''.join(map(_escaped, escaped))}'"
+
+
+def _escaped(letter: str) -> str:
+    """As bash reads it in quotes: other than ASCII by its bytes."""
+    if letter.isprintable() or letter.isascii():
+        return printable(letter)
+    return "".join(f"\\x{byte:02x}" for byte in os.fsencode(letter))
 
 
 @contextmanager

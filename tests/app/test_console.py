@@ -2,6 +2,7 @@
 
 import io
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -78,3 +79,5 @@ def test_control_characters_in_names_become_escapes(capsys):
     assert capsys.readouterr().out == "one\\x1b[31m\ntwo\\r\n"
     assert str(DataError("a\nb", "c\nd", "is missing")) == "a\\nb: c\\nd: is missing"
     assert as_line("kgs", "a b", "it's\na \\") == r"kgs 'a b' $'it\'s\na \\'"
+    assert as_line("d\udcff \x85é") == r"$'d\xff \xc2\x85é'"
+    assert as_line("kgs", Path("./-a"), "-o", Path("b")) == "kgs ./-a -o b"

@@ -377,6 +377,21 @@ def test_what_fails_leaves_a_reason_and_no_file(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_relative_path_may_have_a_colon_and_one_that_is_no_utf8_is_refused(
+    tmp_path: Path, monkeypatch: Any, suffix: str
+) -> None:
+    monkeypatch.setattr(film, "FRAMES", 8)
+    monkeypatch.chdir(tmp_path)
+    folder = Path("2024:05")
+    folder.mkdir()
+    assert write_film(folder / f"film{suffix}", render, views_of((33, 45)), 1.0) == ""
+    assert [path.name for path in folder.iterdir()] == [f"film{suffix}"]
+    wrong = Path("a\udcff")
+    wrong.mkdir()
+    assert "its path is not UTF-8" in write_film(wrong / f"film{suffix}", render, views_of((33, 45)), 1.0)
+    assert list(wrong.iterdir()) == []
+
+
 def test_a_render_that_fails_leaves_what_was_there(tmp_path: Path) -> None:
     (tmp_path / "film.webm").write_bytes(b"before")
 

@@ -106,6 +106,14 @@ def test_a_video_that_gives_no_photos(tmp_path, make, said, capsys):
     assert not (tmp_path / "out" / "images").exists()
 
 
+def test_a_relative_path_may_have_a_colon_and_one_that_is_no_utf8_is_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = write_video(tmp_path / "clip.avi", np.linspace(0, 20, 21).tolist()).rename("22:33.avi")
+    assert len(take(path, 4)) == 4
+    with pytest.raises(DataError, match="its path is not UTF-8"):
+        take(path.rename("a\udcff.avi"))
+
+
 def test_ffmpeg_says_nothing_of_a_broken_video(tmp_path):
     """In a process of its own, since FFmpeg's first use in one decides how much it says."""
     code = "import sys; from pathlib import Path; from kgs.app.sfm.video import _Reader; _Reader(Path(sys.argv[1]))"

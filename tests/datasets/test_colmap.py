@@ -164,6 +164,14 @@ def test_names_with_backslashes_or_in_another_case(tmp_path: Path, change: str) 
     assert torch.equal(after.train.images, before.train.images)
 
 
+@pytest.mark.parametrize("hold_out", [None, 0])
+def test_a_model_without_photos_is_named(tmp_path: Path, hold_out: int | None) -> None:
+    write_colmap(tmp_path, text=True)
+    (tmp_path / "sparse" / "0" / "images.txt").write_text("# none\n")
+    with pytest.raises(DataError, match=f"{tmp_path.name}: expected .*posed images"):
+        load_scene(tmp_path, hold_out=hold_out)
+
+
 @pytest.mark.parametrize("text", [False, True])
 def test_points_without_tracks_are_told_from_no_points(tmp_path: Path, text: bool) -> None:
     """LiDAR's: nothing says which photos see them."""

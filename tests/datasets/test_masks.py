@@ -54,6 +54,23 @@ def beside_the_photo(root: Path) -> None:
     write_mask(root / "images" / "dynamic_mask_0.png", 255 - LEFT)
 
 
+def in_the_photos_folder(root: Path) -> None:
+    write_colmap(root)
+    write_mask(root / "images" / "masks" / "0.png")
+
+
+def in_folders_of_the_photos_names(root: Path) -> None:
+    write_nerfstudio(root)
+    data = json.loads((root / "transforms.json").read_text())
+    for k, frame in enumerate(data["frames"]):
+        path = root / frame["file_path"]
+        frame["file_path"] = f"images/cam{k}/a.png"
+        (root / f"images/cam{k}").mkdir()
+        path.rename(root / frame["file_path"])
+    (root / "transforms.json").write_text(json.dumps(data))
+    write_mask(root / "masks" / "cam0" / "a.png")
+
+
 def larger_and_coloured(root: Path) -> None:
     write_llff(root)
     mask = cv2.resize(LEFT, (64, 48), interpolation=cv2.INTER_NEAREST)
@@ -62,7 +79,15 @@ def larger_and_coloured(root: Path) -> None:
 
 @pytest.mark.parametrize(
     "write",
-    [in_mask_folder, by_whole_name, in_the_file, beside_the_photo, larger_and_coloured],
+    [
+        in_mask_folder,
+        by_whole_name,
+        in_the_file,
+        beside_the_photo,
+        in_the_photos_folder,
+        in_folders_of_the_photos_names,
+        larger_and_coloured,
+    ],
     ids=lambda f: f.__name__,
 )
 def test_black_is_looked_away_from(tmp_path: Path, write: Callable[[Path], None]) -> None:

@@ -125,7 +125,7 @@ def fit(
         size = DETAILS[detail].size
         if config.coarse is None:
             config = replace(config, coarse=COARSE)
-    if preset == "paper" and size is None and downscale is None and not unposed:
+    if preset in ("paper", "plain") and size is None and downscale is None and not unposed:
         size = "field"
     if unposed:
         stages.begin("cameras")

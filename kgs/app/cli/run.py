@@ -229,7 +229,8 @@ def _flags_of(command: Callable[..., Any]) -> dict[str, str]:
 def _check_out(command: Callable[..., Any], prog: str, words: list[str]) -> None:
     """Refuse a command line that lacks nothing but the folder for the results, and suggest one."""
     out = inspect.signature(command).parameters.get("out")
-    is_given = any(word in ("-o", "--out", "-h", "--help", "--help-all") or word.startswith("--out=") for word in words)
+    asked = ("--out", "-h", "--help", "--help-all")
+    is_given = any(word in asked or word.startswith("--out=") or word[:2] == "-o" for word in words)
     is_needed = out is not None and out.kind is out.KEYWORD_ONLY and out.default is out.empty
     if is_given or not is_needed or not words or words[0].startswith("-"):
         return

@@ -81,11 +81,23 @@ def encode(path: Path, frames: Iterable[Frame], size: tuple[int, int]) -> str:
     Returns:
         "", or the reason why there is no such film; what is at `path` then is not one.
     """
+    if why := refused_by_opencv(path):
+        return why
+    path = path.absolute()  # FFmpeg takes what stands before a colon for a protocol
     write = _write_mp4 if path.suffix == MP4 else _write_webm
     count, why = write(path, frames, size)
     if not why and round(cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FRAME_COUNT)) != count:
         why = "it could not be written whole"
     return why
+
+
+def refused_by_opencv(path: Path) -> str:
+    """Why OpenCV cannot be given this path of a film, or ""; it would end the process."""
+    try:
+        str(path.absolute()).encode()
+    except UnicodeEncodeError:
+        return "its path is not UTF-8"
+    return ""
 
 
 def _in_thread(work: Callable[[Any], Any], frames: Iterable[Any]) -> int:

@@ -144,7 +144,7 @@ def _context(content: PageContent, scene: Mapping[str, Any]) -> dict[str, Any]:
     measures_head, measures = measure_table(text.runs)
     folder = resources.files("kgs.app.page")
     return {
-        "title": without_folders(text.title),
+        "title": text.title,
         "lead": f"{_in_words(len(cameras))}. Drag to look around.",
         "strip": _strip(photos, cameras),
         "has_photos": bool(photos.pictures or photos.thumbnails),

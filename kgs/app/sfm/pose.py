@@ -95,7 +95,7 @@ def pose_photos(
         pass
     paths = find_photos(folder)
     check_place(out, folder)
-    opened = open_photos(paths, mask_folder(folder) if masks is None else Path(masks))
+    opened = open_photos(paths, mask_folder(folder, paths) if masks is None else Path(masks))
     inputs = {
         "settings": SETTINGS,
         "seed": seed,
