@@ -1,9 +1,9 @@
 """Masks of photos: pictures beside them that say which pixels are kept.
 
 A mask has the photo's stem (or its whole name before the ending, as COLMAP writes them) and lies in `masks/`, in a
-folder that the user names, or where a layout's file says; masks of photos in subfolders also in subfolders of the same
-names. White is kept. instant-ngp's `dynamic_mask_*.png` beside the
-photos are the other way round: what is not black there moves, and is not kept.
+folder that the user names, or where a layout's file says; those of photos in subfolders may lie in subfolders of the
+same names. White is kept. instant-ngp's `dynamic_mask_*.png` beside the photos are the other way round: what is not
+black there moves, and is not kept.
 
 Sources: https://docs.nerf.studio/quickstart/data_conventions.html (masks); instant-ngp, docs/nerf_dataset_tips.md.
 """
