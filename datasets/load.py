@@ -176,11 +176,11 @@ def _split(
             raise DataError(frame.source, frame.name, f"expected each image once, it is there {where}")
     if frame_set.test is None or hold_out is not None:
         frames = [*frames, *test_frames]
-        if not frames:
-            raise DataError(root, "", "expected posed images, got none")
         every = TEST_EVERY if hold_out is None else hold_out
         if len(frames) < 2 and every:
             raise DataError(root, "", f"expected at least 2 posed images, one of them to test on, got {len(frames)}")
+        if not frames:
+            raise DataError(root, "", "expected posed images, got none")
         names = [frame.name for frame in frames]
         if every and len(frames) > 2 and (root / CAMERAS_REPORT).is_file():  # of photos that came without cameras
             centers = torch.stack([frame.pose[:3, 3] for frame in frames]).numpy()
