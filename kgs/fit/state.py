@@ -162,8 +162,9 @@ class TrainState:
 
     @classmethod
     def from_dict(cls, scene: Scene, plan: Plan, values: dict[str, Any]) -> Self:
-        """The inverse of :meth:`to_dict`; a ValueError, which begins with the entry's name, where one is wrong.
+        """The inverse of :meth:`to_dict`, of values that passed :func:`check_saved`.
 
+        A ValueError, which begins with the entry's name, where another one is wrong.
         On another kind of device random numbers start a new sequence, which `notes` says.
         """
         with state_errors():

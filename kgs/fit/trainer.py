@@ -79,10 +79,11 @@ class Trainer:
             self.load_state_dict(points)
         else:
             check_kind("points", points, InitialPoints)
-            self._use(TrainState.begin(with_exposure(scene, plan.needs), plan, points))
+            exposed = with_exposure(scene, plan.needs)
+            self._use(TrainState.begin(exposed, plan, points), exposed)
 
-    def _use(self, state: TrainState) -> None:
-        """Train on from a state."""
+    def _use(self, state: TrainState, scene: Scene) -> None:
+        """Train on from a state; the scene has the gains that were decided."""
         config = self.plan.config
         self.state = state
         self.renderer = GaussianRenderer(
@@ -93,7 +94,6 @@ class Trainer:
             absgrad=config.recipe.absgrad,
             backend=self.plan.backend,
         ).train()
-        scene = with_exposure(self._given, self.plan.needs)
         self.scene = scene if state.poses is None else place_cameras(scene, state.poses.extrinsics)
         self._views = targets(scene.train, scene.background, self.plan.device)
         self._halved = (
@@ -219,11 +219,11 @@ class Trainer:
             longer = check_saved(values, self._fingerprint, plan.config, plan.times.steps)
             runs = next(x for x in BACKENDS if x.name == values["backend"]).runs_on(plan.device)
             backend = resolve(values["backend"] if runs else "auto", plan.device)
-            with_exposure(self._given, values["needs"])  # checks the gains
+            exposed = with_exposure(self._given, values["needs"])
             state = TrainState.from_dict(self._given, plan, values)
         self.plan = replace(plan, backend=backend, needs=values["needs"])
         state.notes += longer
-        self._use(state)
+        self._use(state, exposed)
 
     def save(self, path: str | PathLike[str], part: dict[str, Any] | None = None) -> None:
         """Write a checkpoint; after an OSError one that was there is still there.

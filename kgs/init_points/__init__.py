@@ -13,6 +13,7 @@ from kgs.geometry import ViewGeometry
 from kgs.progress import ProgressBar, silent
 from kgs.types import check_kind
 
+from .agreement import interpolate
 from .dense import FEWEST, dense_points
 from .depth_limits import MIN_SIFT, certain_points, depth_range, sweep_range
 from .files import read_points
@@ -123,8 +124,9 @@ def initial_points(
     points = _random_points(geometry, count, near, far, generator)
     places, depths = geometry.project(points)
     inside = geometry.inside_images(places, depths, near, far)
-    if views.usable is not None:
-        inside &= _values_at(views.usable.cpu().float()[:, None], places)[..., 0] > 0.5
+    usable = views.usable
+    if usable is not None:
+        inside &= _values_at(usable[:, None].float(), places)[..., 0] > 0.5
     colors = _mean_colors(views.images, places, inside)
     return InitialPoints(points.float(), colors, "random")
 
@@ -148,14 +150,11 @@ def _random_points(geometry: ViewGeometry, count: int, near: float, far: float, 
 
 def _mean_colors(images: Tensor, pixels: Tensor, visible: Tensor) -> Tensor:
     """The mean of the images' colours at pixels `(P, V, 2)`, over the views where `visible` `(P, V)`."""
-    samples = _values_at(images.cpu(), pixels)
+    samples = _values_at(images, pixels)
     weights = (visible / visible.sum(1, keepdim=True))[..., None].to(samples)
     return torch.where(weights > 0, weights * samples, 0.0).sum(1).clamp(0.0, 1.0)
 
 
 def _values_at(images: Tensor, pixels: Tensor) -> Tensor:
-    """The values of images `(V, K, H, W)` at places `(P, V, 2)` in pixels, bilinearly interpolated, `(P, V, K)`."""
-    span = torch.tensor([max(images.shape[-1] - 1, 1), max(images.shape[-2] - 1, 1)])
-    grid = (2.0 * pixels / span - 1.0).transpose(0, 1)[:, :, None].to(images.dtype)
-    samples = torch.nn.functional.grid_sample(images, grid, padding_mode="border", align_corners=True)
-    return samples[..., 0].permute(2, 0, 1)
+    """The values `(P, V, K)` of images `(V, K, H, W)` at places `(P, V, 2)` in pixels."""
+    return torch.stack([interpolate(image, pixels[:, view]) for view, image in enumerate(images.cpu())], 1)

@@ -140,7 +140,7 @@ def _dehomogenise(places: Tensor) -> Tensor:
 
 def interpolate(image: Tensor, pixels: Tensor) -> Tensor:
     """The values `(P, C)` of an image `(C, H, W)` at positions `(P, 2)`, bilinear; outside, those of the border."""
-    last = torch.tensor([image.shape[2] - 1, image.shape[1] - 1])
+    last = torch.tensor([max(image.shape[2] - 1, 1), max(image.shape[1] - 1, 1)])
     grid = (2 * pixels / last - 1)[None, None].to(image.dtype)
     values: Tensor = grid_sample(image[None], grid, padding_mode="border", align_corners=True)[0, :, 0].T
     return values

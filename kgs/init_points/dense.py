@@ -106,8 +106,9 @@ def agreed_depths(
     """The depth maps of the views, averaged, and the pixels that count: inside, usable and well matched."""
     maps = sweep_depths(views, near, far, bar, backend)
     certain = [depth_map.is_inner & (depth_map.scores > SCORE) for depth_map in maps]
-    if views.usable is not None:
-        certain = [mask & usable for mask, usable in zip(certain, views.usable.cpu(), strict=True)]
+    usable = views.usable
+    if usable is not None:
+        certain = [mask & part for mask, part in zip(certain, usable.cpu(), strict=True)]
     return average_depths(ViewGeometry.of(views.cameras), maps, certain), certain
 
 

@@ -22,6 +22,7 @@ RATE = 24  # frames per second
 BITS = 0.2  # of H.264 for each pixel: six seconds of 640x426 have 1.0 MB
 MP4 = ".mp4"
 WEBM = ".webm"
+NOT_UTF8 = "its path is not UTF-8"
 ASKED = "KGS_H264"  # environment variable: the encoder of FFmpeg to use
 _ENCODERS = ("libopenh264", "h264_videotoolbox", "h264_mf")  # BSD; of macOS; of Windows
 _H264 = 27  # FFmpeg's number of the codec
@@ -81,9 +82,10 @@ def encode(path: Path, frames: Iterable[Frame], size: tuple[int, int]) -> str:
     Returns:
         "", or the reason why there is no such film; what is at `path` then is not one.
     """
-    if why := refused_by_opencv(path):
-        return why
-    path = path.absolute()  # FFmpeg takes what stands before a colon for a protocol
+    whole = for_opencv(path)
+    if whole is None:
+        return NOT_UTF8
+    path = whole
     write = _write_mp4 if path.suffix == MP4 else _write_webm
     count, why = write(path, frames, size)
     if not why and round(cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FRAME_COUNT)) != count:
@@ -91,13 +93,17 @@ def encode(path: Path, frames: Iterable[Frame], size: tuple[int, int]) -> str:
     return why
 
 
-def refused_by_opencv(path: Path) -> str:
-    """Why OpenCV cannot be given this path of a film, or ""; it would end the process."""
+def for_opencv(path: Path) -> Path | None:
+    """The path of a film as OpenCV takes it, or None if it is not UTF-8, which would end the process.
+
+    It is absolute: FFmpeg takes what stands before a colon for a protocol.
+    """
+    whole = path.absolute()
     try:
-        str(path.absolute()).encode()
+        str(whole).encode()
     except UnicodeEncodeError:
-        return "its path is not UTF-8"
-    return ""
+        return None
+    return whole
 
 
 def _in_thread(work: Callable[[Any], Any], frames: Iterable[Any]) -> int:

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kgs.app.files.encoders import refused_by_opencv
+from kgs.app.files.encoders import NOT_UTF8, for_opencv
 from kgs.app.files.outputs import write_png
 from kgs.errors import DataError
 from kgs.progress import ProgressBar
@@ -160,17 +160,17 @@ class _Reader:
     """Reads frames of a video in the order of time."""
 
     def __init__(self, video: Path) -> None:
-        if why := refused_by_opencv(video):
-            raise DataError(video, "", f"expected a video that OpenCV can open: {why}")
+        path = for_opencv(video)
+        if path is None:
+            raise DataError(video, "", f"expected a video that OpenCV can open: {NOT_UTF8}")
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # else FFmpeg writes of damage to stderr
-        path = str(video.absolute())  # FFmpeg takes what stands before a colon for a protocol
-        self._capture = cv2.VideoCapture(path)
+        self._capture = cv2.VideoCapture(str(path))
         self._next = 0
         self.count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
         if self.count <= 0:  # the header of a recorder that writes as it goes has none
             self.count = sum(1 for _ in iter(self._capture.grab, False))
             self._capture.release()
-            self._capture = cv2.VideoCapture(path)
+            self._capture = cv2.VideoCapture(str(path))
 
     def __enter__(self) -> Self:
         return self
