@@ -1,11 +1,10 @@
 """What `kgs fit` does, in its order: scene, initial points, training, files, page; then all is published."""
 
-import shutil
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -14,15 +13,23 @@ from typing import Any, NamedTuple
 from kgs.app.console import each, progress, say
 from kgs.app.files.cameras import as_taken
 from kgs.app.files.figures import write_curve
+from kgs.app.files.locks import locked
 from kgs.app.files.outputs import check_folder, png_names, write_png
-from kgs.app.files.ownership import is_own
-from kgs.app.files.results_folder import CHECKPOINT, complete_move, is_finished, locked, replaced_files
-from kgs.app.files.staging import Staging
+from kgs.app.files.publishing import begin, clear, complete, enter, publish, unpublished
+from kgs.app.files.results_folder import (
+    CHECKPOINT,
+    PREVIOUS,
+    RESULTS,
+    discard_fit,
+    is_finished,
+    resumable_fits,
+    step_of,
+)
 from kgs.app.live import LivePage
 from kgs.app.page.fit_page import PAGE, write_own_page
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError, printable
-from kgs.fit.checkpoint import previous, save_checkpoint
+from kgs.fit.checkpoint import save_checkpoint
 from kgs.fit.config import FitConfig
 from kgs.fit.fit import Fit
 from kgs.fit.measures import measure
@@ -47,7 +54,9 @@ class Published(NamedTuple):
 
     fit: Fit
     signal: int  # that ended the training, or 0
-    folder: Path  # where the results are: beside those of a finished fit, if a signal ended this one
+    folder: (
+        Path  # where the results are: `out`, or a folder in it if a signal ended this fit and `out` has a better one
+    )
 
 
 def fit_folder(
@@ -64,15 +73,17 @@ def fit_folder(
 ) -> Published:
     """Fit a scene and write all results of `kgs fit`: splat, film, page, metrics, test images and checkpoints.
 
-    New results are collected in `out/unfinished`, and replace those of a former fit only when all are there. A fit that
-    a signal stopped writes its results too, but does not replace those of a finished fit.
+    New results are collected in a folder of their own in `out`, and replace those of a former fit only when all are
+    there. A fit that a signal stopped writes its results too, but replaces neither a finished fit nor one that got
+    further.
 
     Args:
         scene: posed training and test views.
         config: the settings of the fit.
         out: the folder for the results, created if it does not exist.
         request: how the scene was loaded, for config.json, and how the page shows it.
-        resume: continue from the folder's checkpoint, if there is one.
+        resume: continue the unfinished fit in the folder that got furthest and has these settings, else the finished
+            one.
         lpips: the perceptual metric, or None to leave it out.
         live: show the splat during the fit on a page on this machine, see :class:`kgs.app.live.LivePage`.
         say: called with each line for the user.
@@ -80,7 +91,7 @@ def fit_folder(
 
     Raises:
         DataError: the checkpoint is damaged or belongs to another fit, images are too small, another fit is at work in
-            `out`, or `out` cannot be written to or holds files that kgs did not write and would overwrite.
+            `out`, or `out` cannot be written to or holds the files of a scene.
         TrainingDiverged: a number is not finite, or a scale explodes; the last checkpoint is kept.
         OSError: a result cannot be written.
         ValueError: the device cannot be used, or the backend does not run on it.
@@ -93,52 +104,64 @@ def fit_folder(
     plan = make_plan(scene, config)
     _check_size(scene, config, lpips)
     names = png_names([*scene.train.names, *scene.test.names])
-    _check_out(out, scene, names)
+    _check_out(out, scene)
+    files = [*RESULTS, *(f"test/{names[view]}" for view in scene.test.names)]
     with locked(out), ExitStack() as until_the_end:
-        complete_move(out)
-        staging = Staging(out)
-        trainer, source = _trainer(scene, config, plan, out, resume, say, stages)
+        complete(out, say)
+        trainer, work = _trainer(scene, config, plan, out, resume, say, stages)
         notes = _Notes(trainer, say)
-        new = staging.unfinished
         is_trained = False
         try:
-            if source != new:
-                staging.start()
-                save_checkpoint(new / CHECKPOINT, trainer.state_dict())  # initial points can take a minute
-            write_json(new / "config.json", _settings(trainer, request))
+            if not (work / CHECKPOINT).exists():
+                save_checkpoint(work / CHECKPOINT, trainer.state_dict())  # initial points can take a minute
+            clear(work, ["config.json"], "fit", say)
+            write_json(work / "config.json", _settings(trainer, request))
+            enter(work, "fit", ["config.json"])
             stages.begin("fit")
             page = until_the_end.enter_context(_live_page(trainer, request, out, say)) if live else None
-            fit, stopped_by = train(trainer, new / CHECKPOINT, live=page)
+            fit, stopped_by = train(trainer, work / CHECKPOINT, live=page)
             is_trained = True
+            clear(work, (name for name in files if name not in (CHECKPOINT, PREVIOUS)), "fit", say)
             stages.begin("film")
-            fit = _write_results(fit, new, names, request, lpips)
+            fit = _write_results(fit, work, names, request, lpips)
             for note in fit.notes:
                 trainer.state.note(note)
             stages.begin("page")
-            write_own_page(new, out, fit, request)
+            write_own_page(work, out, fit, request)
             if not trainer.is_saved:  # results and checkpoint belong together
-                trainer.save(new / CHECKPOINT, fit.part)
+                trainer.save(work / CHECKPOINT, fit.part)
+            enter(work, "fit", files)
         except BaseException:
             if is_trained:
+                with suppress(OSError):  # the disk is full
+                    enter(work, "fit", files)
                 notes.say_new()
-                say(f"{printable(new)}: holds the results that could be written")
+                say(f"{printable(work)}: holds the results that could be written")
             elif not trainer.saved:
-                shutil.rmtree(new, ignore_errors=True)
+                discard_fit(work)
             raise
         folder = out
-        if stopped_by and is_finished(out):
-            folder = new
-            staging.enter()
-            kept = f"{printable(out)} keeps its finished fit; this one is in {printable(new)}"
+        if stopped_by and (is_finished(out) or step_of(out) > trainer.step):
+            folder = work
+            kept = f"{printable(out)} keeps its {_state(out)}; this one is in {printable(work)}"
             trainer.state.note(f"{kept}, where a resumed fit goes on")
         else:
-            staging.seal()
-            complete_move(out)
+            others = {other: step_of(other) for other in unpublished(out, "fit") if other != work}
+            photos = unpublished(out, "photos") if request.scene == "." else []
+            publish(work, out, all_former=True, say=say, along=photos)
+            for other, step in others.items():
+                if not stopped_by or step <= trainer.step:
+                    discard_fit(other)
         notes.say_new()
         if page is not None:
             how = f"was stopped at step {trainer.step}" if stopped_by else "is done"
             page.end = f"The fit {how}. Its page: {(folder / PAGE).resolve()}"
     return Published(fit, stopped_by, folder)
+
+
+def _state(folder: Path) -> str:
+    """How far the fit in a folder is, in words."""
+    return "finished fit" if is_finished(folder) else f"fit, which got to step {step_of(folder)}"
 
 
 def _check_size(scene: Scene, config: FitConfig, lpips: Lpips | None) -> None:
@@ -151,11 +174,10 @@ def _check_size(scene: Scene, config: FitConfig, lpips: Lpips | None) -> None:
             raise DataError(scene.root, "images", reason)
 
 
-def _check_out(out: Path, scene: Scene, names: dict[str, str]) -> None:
-    """Make the folder; a DataError where it cannot be written to, or a user's file is in the way."""
-    files = [*replaced_files(out), *(f"test/{names[view]}" for view in scene.test.names)]
+def _check_out(out: Path, scene: Scene) -> None:
+    """Make the folder; a DataError where it cannot be written to, or holds the files of a scene."""
     try:
-        check_folder(out, files, scene.root)
+        check_folder(out, scene.root)
     except OSError as error:
         raise DataError(out, "", f"expected a folder that results can be written to ({error.strerror})") from error
 
@@ -163,26 +185,43 @@ def _check_out(out: Path, scene: Scene, names: dict[str, str]) -> None:
 def _trainer(
     scene: Scene, config: FitConfig, plan: Plan, out: Path, resume: bool, say: Callable[[str], None], stages: Stages
 ) -> tuple[Trainer, Path]:
-    """A trainer that begins, or one that continues; and the folder of its checkpoint, `out` for one that begins."""
+    """A trainer that begins, or one that continues; and the folder of its new results."""
+    fits = resumable_fits(out)
+    if resume and fits:
+        trainer, folder = _resumed(scene, config, fits, say)
+        return trainer, begin(out, "fit") if folder == out else folder
     if resume:
-        for folder in (Staging(out).unfinished, out):
-            path = folder / CHECKPOINT
-            if any(file.exists() for file in (path, previous(path))):
-                trainer = Trainer.resume(scene, config, path)
-                say(f"resumed at step {trainer.step}")
-                return trainer, folder
         say(f"{printable(out)}: there is nothing to resume: the fit starts at the beginning")
-    new = Staging(out).unfinished
-    if (new / CHECKPOINT).exists():
-        say(f"{printable(new)}: the unfinished fit there is replaced now; to go on with it, use --resume")
-    elif is_own(out / "splat.ply"):
-        say(f"{printable(out)}: the fit there is replaced when this one is done; to go on with it, use --resume")
+    elif fits:
+        what = _state(fits[0])
+        until = "this one is done" if is_finished(fits[0]) else "one is done or gets further"
+        say(f"{printable(fits[0])}: keeps its {what}, until {until}; to go on with it, use --resume")
     stages.begin("initial points")
     points = choose_points(scene, config, each)
     say(f"initial points: {len(points.points)} ({points.kind})")
     memory = expected_memory(scene, most_gaussians(plan.config, len(points.points)))
     say(f"the fit takes up to {memory / 2**30:.1f} GiB of memory")
-    return Trainer(scene, decide(plan, points), points), out
+    return Trainer(scene, decide(plan, points), points), begin(out, "fit")
+
+
+def _resumed(scene: Scene, config: FitConfig, folders: list[Path], say: Callable[[str], None]) -> tuple[Trainer, Path]:
+    """The trainer of the first of several folders whose fit has these settings, and that folder.
+
+    If there is none: a DataError about the first one.
+    """
+    refused: DataError | None = None
+    for folder in folders:
+        try:
+            trainer = Trainer.resume(scene, config, folder / CHECKPOINT)
+        except DataError as error:
+            refused = refused or error
+            continue
+        if refused is not None:
+            say(str(refused))
+        say(f"resumed at step {trainer.step}")
+        return trainer, folder
+    assert refused is not None  # there is a folder
+    raise refused
 
 
 def _live_page(

@@ -7,7 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kgs.app.files.results_folder import CHECKPOINT, complete_stopped_move
+from kgs.app.files.publishing import complete
+from kgs.app.files.results_folder import CHECKPOINT
 from kgs.backends import former_or_auto
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
@@ -55,7 +56,7 @@ def load_fit(
     Raises:
         DataError: config.json, the checkpoint or the scene is missing, damaged, or does not fit the others.
     """
-    complete_stopped_move(out)
+    complete(out)
     request, settings = read_settings(out / "config.json")
     path = out / CHECKPOINT
     metrics = read_json(out / "metrics.json")

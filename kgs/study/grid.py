@@ -16,7 +16,7 @@ from typing import Any
 from distributed import Client, KilledWorker, LocalCluster, Security, as_completed
 from distributed.core import rpc
 
-from kgs.app.files.results_folder import held
+from kgs.app.files.locks import held
 
 from .running import Running
 

@@ -13,7 +13,7 @@ from compressed_reader import decode
 from factories import random_model
 
 import kgs
-from kgs.app.files.ownership import is_own, writing
+from kgs.app.files.publishing import is_own, replacing
 
 
 @pytest.fixture
@@ -29,7 +29,8 @@ def test_it_says_how_many_bytes_are_left(splat: Path, tmp_path: Path, capsys: An
         assert run("export", splat, "-o", out) == 0
     said = capsys.readouterr().out
     assert f"{out}: 300 Gaussians, 0.01 MB of 0.03" in said
-    assert is_own(out)
+    assert is_own(tmp_path, out.name)
+    assert not (tmp_path / "kept").exists()
     kgs.save_compressed_ply(tmp_path / "same.ply", kgs.load_ply(splat))
     assert out.read_bytes() == (tmp_path / "same.ply").read_bytes()
 
@@ -42,22 +43,33 @@ def test_an_origin_makes_map_coordinates_small(tmp_path: Path) -> None:
     np.testing.assert_allclose(decode(out)["means"], model.means.detach().numpy(), atol=0.01)
 
 
+@pytest.mark.parametrize("is_of_a_fit", [True, False])
+def test_another_file_of_this_name_is_kept(splat: Path, tmp_path: Path, capsys: Any, is_of_a_fit: bool) -> None:
+    """The user's, or a result of another command."""
+    if is_of_a_fit:
+        with replacing(tmp_path, "fit") as new:
+            (new / "a.ply").write_bytes(b"other")
+    else:
+        (tmp_path / "a.ply").write_bytes(b"other")
+    assert run("export", splat, "-o", tmp_path / "a.ply") == 0
+    assert "is now kept/a.ply" in capsys.readouterr().out
+    assert (tmp_path / "kept" / "a.ply").read_bytes() == b"other"
+    assert len(decode(tmp_path / "a.ply")["means"]) == 300
+
+
 def test_mistakes_are_a_line_and_change_nothing(splat: Path, tmp_path: Path, capsys: Any) -> None:
-    (tmp_path / "mine.ply").write_bytes(b"mine")
+    (tmp_path / "folder.ply").mkdir()
     kgs.save_ply(tmp_path / "none.ply", random_model(0))
     assert run("export", splat, "-o", tmp_path / "own.ply") == 0
-    with writing(tmp_path, "fit", ["fitted.ply"]):
-        kgs.save_ply(tmp_path / "fitted.ply", random_model(2))
     capsys.readouterr()
-    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    before = {path: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()}
     for given, out, said in (
         ("splat.ply", "a.sog", "--out: "),
-        ("splat.ply", "mine.ply", "mine.ply: "),
-        ("splat.ply", "fitted.ply", "fitted.ply: "),
+        ("splat.ply", "folder.ply", "folder.ply: "),
         ("splat.ply", "nowhere/a.ply", "a.ply: "),
         ("none.ply", "a.ply", "none.ply: vertex: "),
         ("own.ply", "own.ply", "--out: "),  # the rounded file would take the place of the plain one
     ):
         assert run("export", tmp_path / given, "-o", tmp_path / out) == 2
         assert said in one_line(capsys)
-    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+    assert {path: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()} == before

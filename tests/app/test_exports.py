@@ -21,9 +21,8 @@ from kgs.app.cli.render import render
 from kgs.app.files import exports
 from kgs.app.files.cameras import camera_list, upright
 from kgs.app.files.outputs import EXPORTS
-from kgs.app.files.ownership import is_own
 from kgs.app.files.preview import write_preview
-from kgs.app.files.staging import Staging
+from kgs.app.files.publishing import is_own, replacing
 from kgs.datasets import Scene
 from kgs.fit import Fit
 from kgs.geometry import typical_depths
@@ -133,13 +132,10 @@ def test_the_film_that_cannot_be_is_a_note(fit: Fit, tmp_path: Path, monkeypatch
 
 def test_one_film_takes_the_place_of_the_other(fit: Fit, tmp_path: Path, monkeypatch: Any) -> None:
     pytest.importorskip("av")
-    staging = Staging(tmp_path)
 
     def publish() -> list[str]:
-        staging.start()
-        exports.write_exports(fit, staging.unfinished)
-        staging.seal()
-        staging.complete()
+        with replacing(tmp_path, "fit", all_former=True) as new:
+            exports.write_exports(fit, new)
         return sorted(path.name for path in tmp_path.glob("turntable.*"))
 
     assert publish() == ["turntable.webm"]
@@ -171,7 +167,7 @@ def test_a_png_with_alpha_over_a_background_is_the_opaque_one(folder: Path, tmp_
         assert share.max() > 0.5
         composed = share * clear[:, :, :3] + (1 - share) * (255 if background == "white" else 0)
         assert np.abs(composed - opaque).max() <= 1.6  # three values, each rounded to 8 bits
-        assert is_own(tmp_path / "clear" / name)
+        assert is_own(tmp_path / "clear", name)
 
 
 def test_the_film_leaves_out_what_is_right_before_its_camera(fit: Fit, tmp_path: Path, monkeypatch: Any) -> None:

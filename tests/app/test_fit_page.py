@@ -18,7 +18,7 @@ from factories import random_views
 
 from kgs.app import fit_folder as app
 from kgs.app.cli.evaluate import evaluate
-from kgs.app.files.ownership import is_own
+from kgs.app.files.publishing import is_own
 from kgs.app.page import fit_page
 from kgs.app.page.fit_page import spread, write_fit_page, write_own_page
 from kgs.app.saved_fit import load_fit
@@ -173,11 +173,11 @@ def done(measured: Path, tmp_path: Path) -> Path:
 def test_eval_keeps_a_page_that_the_user_changed(done: Path, capsys: Any) -> None:
     (done / "index.html").write_text("mine")
     evaluate(done)
-    assert (done / "index.html").read_text(encoding="utf-8") == "mine"
+    assert (done / "kept" / "index.html").read_text(encoding="utf-8") == "mine"
     said = capsys.readouterr().out
-    assert "index.html was not written by kgs" in said
+    assert "kept/index.html" in said
     assert "LPIPS" not in said
-    assert not is_own(done / "index.html")
+    assert is_own(done, "index.html")
 
 
 def test_the_scene_and_the_fit_come_back(folder: Path, measured: Path) -> None:
@@ -213,8 +213,8 @@ def test_eval_adds_lpips_to_measures_and_page(done: Path, monkeypatch: Any, caps
     assert f"LPIPS {after['test']['lpips_vgg']:.4g}" in capsys.readouterr().out
     assert ">LPIPS</th>" in (done / "index.html").read_text(encoding="utf-8")
     assert (done / "index.html").stat().st_size > 50_000
-    assert is_own(done / "index.html")
-    assert is_own(done / "metrics.json")
+    assert is_own(done, "index.html")
+    assert is_own(done, "metrics.json")
 
 
 def flat_views(masks: Any = None, transmittance: Any = None) -> Views:

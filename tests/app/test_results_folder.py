@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,10 +20,10 @@ import torch
 from kgs.app import fit_folder as app
 from kgs.app.cli.demo import check_demo
 from kgs.app.cli.evaluate import check_evaluate, evaluate
-from kgs.app.cli.unposed import find_scene
-from kgs.app.files import staging
-from kgs.app.files.ownership import is_own
-from kgs.app.files.results_folder import CHECKPOINT, locked, photo_staging
+from kgs.app.files import publishing
+from kgs.app.files.locks import locked
+from kgs.app.files.publishing import begin, enter, is_own, unpublished
+from kgs.app.files.results_folder import CHECKPOINT
 from kgs.app.saved_fit import load_fit
 from kgs.app.scene_request import SceneRequest
 from kgs.datasets.synthetic import synthetic_scene
@@ -73,7 +74,7 @@ def contents(out: Path) -> dict[str, bytes]:
     return {path.relative_to(out).as_posix(): path.read_bytes() for path in out.rglob("*") if path.is_file()}
 
 
-def full(path: Any, *_: Any) -> Any:
+def full(path: Any, *_: Any, **__: Any) -> Any:
     """Stands in for a write on a full disk."""
     raise OSError(28, "No space left on device", str(path))
 
@@ -94,8 +95,8 @@ def test_a_second_fit_in_the_folder_is_refused(scene: Any, tmp_path: Path) -> No
 
 
 def test_a_killed_process_leaves_no_lock(tmp_path: Path) -> None:
-    code = "import sys, time, pathlib, kgs.app.files.results_folder as folder\n"
-    code += "with folder.locked(pathlib.Path(sys.argv[1])):\n    print('locked', flush=True)\n    time.sleep(60)"
+    code = "import sys, time, pathlib, kgs.app.files.locks as locks\n"
+    code += "with locks.locked(pathlib.Path(sys.argv[1])):\n    print('locked', flush=True)\n    time.sleep(60)"
     with subprocess.Popen([sys.executable, "-c", code, tmp_path], stdout=subprocess.PIPE) as process:
         assert process.stdout.readline()
         with pytest.raises(DataError, match="another fit"), locked(tmp_path):
@@ -111,7 +112,6 @@ def test_a_fit_that_fails_at_once_changes_nothing(scene: Any, done: Path, monkey
     with pytest.raises(TrainingDiverged, match="step 1.*no checkpoint yet"):
         fit(scene, OTHER, done)
     assert contents(done) == before
-    assert "unfinished" not in os.listdir(done)
 
 
 def test_results_that_cannot_be_written_leave_the_old_ones(scene: Any, done: Path, monkeypatch: Any) -> None:
@@ -142,7 +142,7 @@ def test_results_of_a_full_disk_are_kept_where_no_checkpoint_could_be_written(
     lines: list[str] = []
     with pytest.raises(OSError, match="space") as error:
         fit(scene, CONFIG, tmp_path, say=lines.append)
-    unfinished = tmp_path / "unfinished"
+    unfinished = tmp_path / "unfinished-1"
     assert error.value.filename == str(unfinished / "test" / "test_00.png")
     assert {"splat.ply", "curve.png", "cameras.json"} <= set(os.listdir(unfinished))
     assert any(line.startswith(f"{unfinished}: holds the results") for line in lines)
@@ -171,7 +171,7 @@ def test_a_fit_is_finished_only_with_the_checkpoint_of_its_last_step(
         return
     with pytest.raises(OSError, match="No space"):
         fit(scene, OTHER, done, say=lines.append)
-    assert any(line.startswith(f"{done / 'unfinished'}: holds the results") for line in lines)
+    assert any(line.startswith(f"{done / 'unfinished-1'}: holds the results") for line in lines)
     assert seed_of(done) == 0
     monkeypatch.undo()
     fit(scene, OTHER, done, resume=True)
@@ -198,40 +198,51 @@ def test_a_forged_checkpoint_is_refused(done: Path, changes: dict[str, Any], fie
     assert (error.value.path, error.value.field) == (path, field)
 
 
+def killed_before_the_move(patch: Any) -> None:
+    """From now on a process is killed when all results are there, but none is in its place."""
+
+    def kill(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    patch.setattr(publishing, "complete", kill)
+
+
 @pytest.mark.parametrize("moves", [0, 1, 3, 7])
 def test_a_kill_while_files_are_moved(scene: Any, done: Path, monkeypatch: Any, moves: int) -> None:
-    (done / "finished").mkdir()  # half removed
     plain = os.replace
     calls = []
 
     def killed(source: Any, target: Any) -> None:
-        if Path(source).name == "unfinished" or calls:
+        if Path(source).parent.name == "unfinished-1" and Path(target).parent == done:
             calls.append(source)
         if len(calls) > moves:
             raise KeyboardInterrupt
         plain(source, target)
 
-    monkeypatch.setattr(staging.os, "replace", killed)
+    monkeypatch.setattr(publishing.os, "replace", killed)
     with pytest.raises(KeyboardInterrupt):
         fit(scene, OTHER, done)
     monkeypatch.undo()
-    assert all(is_own(path) for path in done.rglob("*") if path.is_file() and path.name[0] != ".")
     load_fit(done)  # ends the move
-    assert seed_of(done) == (0 if moves == 0 else 1)
-    assert not (done / "finished").exists()
+    assert seed_of(done) == 1
+    assert folders(done) == ["test"]
 
 
-def test_a_kill_between_seal_and_complete(scene: Any, done: Path, monkeypatch: Any) -> None:
+def folders(out: Path) -> list[str]:
+    return sorted(path.name for path in out.iterdir() if path.is_dir())
+
+
+def test_a_kill_before_files_are_moved(scene: Any, done: Path, monkeypatch: Any) -> None:
     fewer = replace(scene, test=scene.test.select([1]))
-    with monkeypatch.context() as patch:
-        patch.setattr(staging.Staging, "complete", lambda self: None)
+    with monkeypatch.context() as patch, suppress(KeyboardInterrupt):
+        killed_before_the_move(patch)
         fit(fewer, OTHER, done)
     assert json.loads((done / "metrics.json").read_text())["seed"] == 0
     assert len(list((done / "test").iterdir())) == 2
-    assert fit(fewer, OTHER, done, resume=True)[0] == "resumed at step 3"  # of what was sealed
+    assert fit(fewer, OTHER, done, resume=True)[0] == "resumed at step 3"  # of what was whole
     assert seed_of(done) == 1
     assert len(list((done / "test").iterdir())) == 1
-    assert not (done / "finished").exists()
+    assert folders(done) == ["test"]
 
 
 @pytest.mark.parametrize(("root", "is_placed"), [(".", True), ("/photos", False)])
@@ -239,33 +250,17 @@ def test_cameras_that_waited_for_a_fit_come_with_it(
     scene: Any, done: Path, monkeypatch: Any, root: str, is_placed: bool
 ) -> None:
     """After a kill, too: a fit never shows itself beside the cameras of another one."""
-    photos = photo_staging(done)
-    photos.start()
-    (photos.unfinished / "photos.json").write_text("{}")
-    photos.seal()
-    with monkeypatch.context() as patch:
-        patch.setattr(staging.Staging, "complete", lambda self: None)
+    photos = begin(done, "photos")
+    (photos / "photos.json").write_text("{}")
+    enter(photos, "photos")
+    with monkeypatch.context() as patch, suppress(KeyboardInterrupt):
+        killed_before_the_move(patch)
         app.fit_folder(scene, OTHER, done, SceneRequest(root), say=lambda line: None)
     assert not (done / "photos.json").exists()
     load_fit(done)
     assert seed_of(done) == 1
     assert (done / "photos.json").exists() == is_placed
-    assert photos.is_waiting != is_placed
-
-
-def test_a_stopped_move_is_completed_before_other_cameras_are_found(scene: Any, done: Path, monkeypatch: Any) -> None:
-    """They may have to wait where the cameras of the moved fit are."""
-    with monkeypatch.context() as patch:
-        patch.setattr(staging.Staging, "complete", lambda self: None)
-        fit(scene, OTHER, done)
-    found = []
-    monkeypatch.setattr("kgs.app.sfm.find.notes_on", lambda photos: [])
-    monkeypatch.setattr(
-        "kgs.app.sfm.pose_photos", lambda *_, **__: found.append(seed_of(done)) or sys.exit("no cameras")
-    )
-    with pytest.raises(SystemExit):
-        find_scene(Path("/photos"), done, SceneRequest("/photos"), seed=0)
-    assert found == [1]
+    assert unpublished(done, "photos") == ([] if is_placed else [photos])
 
 
 def test_eval_does_not_pass_off_the_checkpoint_of_another_step(scene: Any, done: Path) -> None:
@@ -294,26 +289,27 @@ def test_eval_does_not_write_over_a_fit_that_came_meanwhile(scene: Any, done: Pa
 
 
 def test_eval_says_how_to_go_on_with_a_fit_that_was_killed(tmp_path: Path) -> None:
-    staging.Staging(tmp_path).start()
+    begin(tmp_path, "fit")
     with pytest.raises(DataError, match="kgs fit --resume"):
         check_evaluate(tmp_path, None, "cpu", "auto")
 
 
-def test_an_eval_that_fails_while_it_writes_leaves_files_of_kgs(scene: Any, done: Path, monkeypatch: Any) -> None:
-    with monkeypatch.context() as patch:
-        patch.setattr("kgs.app.page.fit_page.write_own_page", full)
-        with pytest.raises(OSError, match="space"):
-            evaluate(done)
-    fit(scene, OTHER, done)
-    assert seed_of(done) == 1
+def test_an_eval_that_fails_while_it_writes_changes_nothing(scene: Any, done: Path, monkeypatch: Any) -> None:
+    before = contents(done)
+    monkeypatch.setattr("kgs.app.page.fit_page.write_own_page", full)
+    with pytest.raises(OSError, match="space"):
+        evaluate(done)
+    assert contents(done) == before
 
 
-@pytest.mark.slow
-def test_what_an_unfinished_fit_is_replaced_by_is_said(scene: Any, done: Path) -> None:
-    assert "is replaced when this one is done; to go on with it, use --resume" in fit(scene, CONFIG, done)[0]
-    staging.Staging(done).start()
-    shutil.copy(done / CHECKPOINT, done / "unfinished")
-    assert "unfinished: the unfinished fit there is replaced now" in fit(scene, CONFIG, done)[0]
+def test_what_another_fit_is_kept_until_is_said(scene: Any, done: Path) -> None:
+    (first,) = [line for line in fit(scene, CONFIG, done) if "--resume" in line]
+    assert first == f"{done}: keeps its finished fit, until this one is done; to go on with it, use --resume"
+    unfinished = begin(done, "fit")
+    shutil.copy(done / CHECKPOINT, unfinished)
+    (second,) = [line for line in fit(scene, CONFIG, done) if "--resume" in line]
+    assert second.startswith(f"{unfinished}: keeps its fit, which got to step 3, until one is done or gets further")
+    assert folders(done) == ["test"]
 
 
 def test_a_demo_does_not_mix_with_a_fit(done: Path) -> None:
@@ -321,12 +317,23 @@ def test_a_demo_does_not_mix_with_a_fit(done: Path) -> None:
         check_demo(done, size=(24, 32), steps=3, device="cpu", backend="auto")
 
 
-def test_a_file_of_kgs_that_the_user_changed_is_the_users(scene: Any, done: Path) -> None:
-    (done / "cameras.json").write_text("[]")
-    with pytest.raises(DataError, match="not written by kgs"):
-        fit(scene, OTHER, done)
-    assert (done / "cameras.json").read_text() == "[]"
-    assert "unfinished" not in os.listdir(done)
+def test_a_file_that_the_user_writes_or_changes_during_a_fit_is_kept(scene: Any, done: Path, monkeypatch: Any) -> None:
+    """In the folder of the results and in that of the unfinished fit; and a line says where."""
+    plain = Trainer._descend
+
+    def meanwhile(self: Trainer) -> float:
+        for name in ("cameras.json", "notes.txt", "unfinished-1/notes.txt", "unfinished-1/splat.ply"):
+            (done / name).write_text("mine")
+        return plain(self)
+
+    monkeypatch.setattr(Trainer, "_descend", meanwhile)
+    lines = fit(scene, OTHER, done)
+    assert seed_of(done) == 1
+    for name in ("kept/cameras.json", "notes.txt", "unfinished-1/notes.txt", "unfinished-1/kept/splat.ply"):
+        assert (done / name).read_text() == "mine"
+    for name in ("kept/cameras.json", "kept/splat.ply"):
+        assert any(line.endswith(f"not as kgs wrote it is now {name}") for line in lines)
+    assert folders(done) == ["kept", "test", "unfinished-1"]
 
 
 def test_what_the_new_results_lack_goes_but_for_what_is_the_users(scene: Any, done: Path) -> None:
@@ -344,32 +351,74 @@ def test_what_the_new_results_lack_goes_but_for_what_is_the_users(scene: Any, do
     assert (done / "test" / first).read_text() == "mine"
 
 
-def test_an_interrupted_fit_leaves_a_finished_one_in_its_place(scene: Any, done: Path, monkeypatch: Any) -> None:
+def interrupt_at(step: int, patch: Any) -> None:
+    """The process gets SIGINT as this step begins."""
     plain = Trainer._descend
 
     def interrupted(self: Trainer) -> float:
-        if self.step == 1:
+        if self.step == step:
             os.kill(os.getpid(), signal.SIGINT)
         return plain(self)
 
-    monkeypatch.setattr(Trainer, "_descend", interrupted)
+    patch.setattr(Trainer, "_descend", interrupted)
+
+
+def test_an_interrupted_fit_leaves_a_finished_one_in_its_place(scene: Any, done: Path, monkeypatch: Any) -> None:
+    interrupt_at(1, monkeypatch)
     lines = fit(scene, OTHER, done)
+    unfinished = done / "unfinished-1"
     assert f"{done} keeps its finished fit" in lines[-1]
     assert seed_of(done) == 0
-    assert seed_of(done / "unfinished") == 1
-    assert is_own(done / "unfinished" / "index.html")  # so that `kgs eval` can write it again
+    assert seed_of(unfinished) == 1
+    assert is_own(unfinished, "index.html")
     monkeypatch.undo()
     assert fit(scene, OTHER, done, resume=True)[0] == "resumed at step 2"
     assert seed_of(done) == 1
-    assert not (done / "unfinished").exists()
+    assert folders(done) == ["test"]
+
+
+def test_what_got_further_is_kept_until_one_is_further_or_done(scene: Any, tmp_path: Path, monkeypatch: Any) -> None:
+    """The same command again and again, stopped at steps 4, 2, 5 of 7 and then never."""
+    config = replace(CONFIG, steps=7)
+    for stop, published, unfinished in ((4, 4, []), (2, 4, ["unfinished-1"]), (5, 5, [])):
+        with monkeypatch.context() as patch:
+            interrupt_at(stop - 1, patch)
+            fit(scene, config, tmp_path)
+        assert load_checkpoint(tmp_path / CHECKPOINT)["step"] == published
+        assert folders(tmp_path) == ["test", *unfinished]
+        assert seed_of(tmp_path) == 0
+    work = begin(tmp_path, "fit")  # and one that was killed further on
+    save_checkpoint(work / CHECKPOINT, load_checkpoint(tmp_path / CHECKPOINT) | {"step": 6})
+    with monkeypatch.context() as patch:
+        interrupt_at(5, patch)
+        assert fit(scene, config, tmp_path, resume=True)[0] == "resumed at step 6"
+    shutil.copytree(tmp_path, tmp_path.with_name("copy"))
+    assert fit(scene, config, tmp_path)[-1]
+    assert folders(tmp_path) == ["test"]
+    assert load_checkpoint(tmp_path / CHECKPOINT)["step"] == 7
+
+
+def test_the_fit_with_these_settings_is_gone_on_with(scene: Any, tmp_path: Path, monkeypatch: Any) -> None:
+    """Of several that were stopped; where none has them, the error is about the furthest."""
+    for config, stop in ((CONFIG, 2), (OTHER, 1)):
+        with monkeypatch.context() as patch:
+            interrupt_at(stop - 1, patch)
+            fit(scene, config, tmp_path)
+    assert [seed_of(tmp_path), seed_of(tmp_path / "unfinished-1")] == [0, 1]
+    with pytest.raises(DataError, match="seed: expected 0") as error:
+        fit(scene, replace(CONFIG, seed=2), tmp_path, resume=True)
+    assert error.value.path == tmp_path / CHECKPOINT
+    lines = fit(scene, OTHER, tmp_path, resume=True)
+    assert lines[1] == "resumed at step 1"
+    assert "seed" in lines[0]  # why not the furthest
+    assert seed_of(tmp_path) == 1
 
 
 def test_an_unfinished_fit_with_other_settings_is_not_lost_when_the_finished_one_is_resumed(
     scene: Any, done: Path
 ) -> None:
     unfinished = Trainer(scene, make_plan(scene, OTHER), app.choose_points(scene, OTHER))
-    staging.Staging(done).start()
-    path = done / "unfinished" / CHECKPOINT
+    path = begin(done, "fit") / CHECKPOINT
     unfinished.save(path)
     kept = path.read_bytes()
     message = f"{re.escape(str(path))}: steps: expected 3, as the fit was begun with"
@@ -377,21 +426,23 @@ def test_an_unfinished_fit_with_other_settings_is_not_lost_when_the_finished_one
         fit(scene, replace(CONFIG, steps=5), done, resume=True)
     assert error.value.path == path
     assert path.read_bytes() == kept
-    shutil.rmtree(done / "unfinished")
+    shutil.rmtree(path.parent)
     lines = fit(scene, replace(CONFIG, steps=5), done, resume=True)
     assert lines[0] == "resumed at step 3"
     assert "trained on from step 3" in lines[1]
     assert json.loads((done / "metrics.json").read_text())["steps"] == 5
 
 
-@pytest.mark.parametrize("name", ["finished", "unfinished", CHECKPOINT, previous(Path(CHECKPOINT)).name])
+@pytest.mark.parametrize("name", ["unfinished-1/thesis.txt", "test/thesis.txt", "splat.ply", CHECKPOINT])
 def test_what_another_program_or_person_made_stays(scene: Any, tmp_path: Path, name: str) -> None:
-    mine = tmp_path / name / "thesis.txt" if "." not in name else tmp_path / name
+    """Also where it is a file of kgs by its name: that is moved."""
+    mine = tmp_path / name
     mine.parent.mkdir(exist_ok=True)
     mine.write_text("mine")
-    with pytest.raises(DataError, match=f"{name}: was not written by kgs.*choose another folder"):
-        fit(scene, CONFIG, tmp_path)
-    assert mine.read_text() == "mine"
+    fit(scene, CONFIG, tmp_path)
+    kept = mine if mine.name == "thesis.txt" else tmp_path / "kept" / name
+    assert kept.read_text() == "mine"
+    assert seed_of(tmp_path) == 0
 
 
 def test_a_damaged_checkpoint_of_a_fit_does_not_stand_in_the_way(scene: Any, done: Path) -> None:

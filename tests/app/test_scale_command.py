@@ -15,7 +15,7 @@ from command import one_line, run
 from factories import as_model, random_gaussians
 
 import kgs
-from kgs.app.files.ownership import is_own
+from kgs.app.files.publishing import is_own
 
 FIT = ("--init", "scene", "--max-gaussians", 300, "--steps", 3, "--evaluations", 1)
 A = "-1,2,0.5"
@@ -54,7 +54,7 @@ def test_all_files_of_a_fit_are_scaled_alike(fitted: Path, metres: Path) -> None
         np.testing.assert_allclose(new, 2.5 * np.array(old), rtol=1e-5)
     old, new = (document["nodes"][0]["translation"] for document in documents)
     np.testing.assert_allclose(new, 2.5 * np.array(old), rtol=1e-5, atol=1e-6)
-    assert is_own(metres / "splat.ply")
+    assert is_own(metres, "splat.ply")
 
 
 def content_of(path: Path) -> Any:
@@ -108,22 +108,22 @@ def test_two_points_and_a_length_are_needed(fitted: Path, tmp_path: Path, by: An
     assert not (tmp_path / "out").exists()
 
 
-def test_nothing_else_is_overwritten(fitted: Path, tmp_path: Path, capsys: Any) -> None:
-    other = tmp_path / "other"
-    other.mkdir()
-    (other / "splat.ply").write_text("mine")
+def test_a_file_of_the_user_is_kept(fitted: Path, tmp_path: Path) -> None:
+    (tmp_path / "splat.ply").write_text("mine")
+    assert run("scale", fitted, "--by", A, B, LENGTH, "-o", tmp_path) == 0
+    assert (tmp_path / "kept" / "splat.ply").read_text() == "mine"
+    assert len(kgs.load_ply(tmp_path / "splat.ply"))
+
+
+def test_what_is_read_is_not_overwritten(fitted: Path, tmp_path: Path, capsys: Any) -> None:
     by = ("--by", A, B, LENGTH)
     for splat, out, field in (
         (fitted, fitted, str(fitted)),  # which has the fit that goes on from its checkpoint
-        (fitted, other, "splat.ply"),
         (tmp_path, tmp_path / "out", "config.json"),
         (fitted / "splat.ply", tmp_path / "out", "--out"),
-        (fitted / "splat.ply", other / "splat.ply", "splat.ply"),
         (fitted / "splat.ply", tmp_path / "none" / "splat.ply", "none"),
         (fitted / "splat.ply", fitted / "splat.ply", "--out"),
-        (fitted / "splat.ply", fitted / "splat.compressed.ply", "splat.compressed.ply"),  # of the fit
     ):
         assert run("scale", splat, *by, "-o", out) == 2
         assert field in one_line(capsys)
-    assert (other / "splat.ply").read_text() == "mine"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["other"]
+    assert not list(tmp_path.iterdir())

@@ -127,7 +127,14 @@ def test_the_report_says_what_was_found(posed):
     assert min(row[2] for row in report["matches"]) > 50
     assert report["versions"]["pycolmap"] == pycolmap.__version__
     assert report["focal_35mm"] == pytest.approx(report["focal_px"] * 43.2666 / np.hypot(*report["size"]), rel=1e-4)
-    assert sorted(path.name for path in out.iterdir()) == [".kgs.json", ".lock", "images", "photos.json", "sparse"]
+    assert sorted(path.name for path in out.iterdir()) == [
+        ".kgs.json",
+        ".kgs.lock",
+        ".lock",
+        "images",
+        "photos.json",
+        "sparse",
+    ]
     assert str(folder) not in (out / "photos.json").read_text()
     assert any("3 photos" in line for line in lines)
 

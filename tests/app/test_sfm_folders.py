@@ -1,6 +1,7 @@
 """What a user's folder may hold instead of photos that fit together: what happened, and what to do, is said."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,13 +16,11 @@ from limits import limited
 from photo_folders import close, planes, write_photos, write_planes
 
 from kgs.app.files.outputs import write_png
-from kgs.app.files.ownership import writing
-from kgs.app.files.results_folder import photo_staging
+from kgs.app.files.publishing import publish, replacing
 from kgs.app.sfm import pose, pose_photos
 from kgs.app.sfm.find import find_photos, notes_on
 from kgs.app.sfm.read import blurred, open_photos, read_photos
 from kgs.errors import DataError
-from kgs.json_files import write_json
 from kgs.progress import silent
 
 pytest.importorskip("pycolmap")
@@ -197,29 +196,12 @@ def test_results_do_not_go_among_the_photos_or_over_another_scene(folder, tmp_pa
     save(tmp_path / "other" / "images", planes())
     for out, said in (
         (folder, "the photos themselves"),
-        *((tmp_path / n, "kgs did not write") for n in ("scene", "other")),
+        (tmp_path / "scene", "files of a scene"),
+        (tmp_path / "other", "kgs did not write"),
     ):
         refused(folder, "choose another folder", out=out)
         with pytest.raises(DataError, match=f"{said}.*: choose another folder"):
             pose_photos(folder, out)
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        *(f"{name}/deeper/IMG_1.HEIC" for name in ("images", "sparse", "finished", "unfinished")),
-        *(f"{name}/notes.txt" for name in ("finished-photos", "unfinished-photos")),
-        "checkpoint.safetensors",
-        "checkpoint.previous.safetensors",
-    ],
-)
-def test_a_users_own_files_stay(folder, tmp_path, refused, name):
-    """Also such as kgs does not read: HEIC photos, notes, checkpoints of another program."""
-    mine = tmp_path / "project" / name
-    mine.parent.mkdir(parents=True)
-    mine.write_bytes(b"mine")
-    refused(write_planes(folder), "choose another folder", out=tmp_path / "project", kept=True)
-    assert mine.read_bytes() == b"mine"
 
 
 def test_photos_that_lie_where_results_go_are_refused(tmp_path, refused):
@@ -227,50 +209,34 @@ def test_photos_that_lie_where_results_go_are_refused(tmp_path, refused):
     refused(images, "choose another folder", out=tmp_path)
     for path in images.iterdir():  # as renders of kgs are
         write_png(path, torch.rand(3, 8, 8))
-    with writing(images, "renders", [path.name for path in images.glob("*.png")]):
-        pass
+    with replacing(images, "renders") as new:
+        for path in images.glob("*.png"):
+            shutil.copy(path, new)
     with pytest.raises(DataError, match="holds the photos themselves"):
         pose_photos(images, tmp_path)
     assert len(list(images.glob("*.png"))) == 3
-
-
-def test_a_move_that_was_stopped_is_ended(tmp_path):
-    """A kill between the renaming of the new folder and the last of its parts."""
-    staging = photo_staging(tmp_path)
-    for name in ("old.png", "new.png"):
-        staging.start()
-        (staging.unfinished / "sparse" / "0").mkdir(parents=True)
-        (staging.unfinished / "sparse" / "0" / "cameras.bin").touch()
-        save(staging.unfinished / "images", planes()[:1], [name])
-        write_json(staging.unfinished / "photos.json", {})
-        staging.seal()
-        if name == "new.png":
-            os.replace(staging.finished / "photos.json", tmp_path / "photos.json")
-        staging.complete()
-    left = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.name[0] != ".")
-    assert left == ["images", "images/new.png", "photos.json", "sparse", "sparse/0", "sparse/0/cameras.bin"]
 
 
 def test_a_users_photos_among_pictures_of_kgs_stay(folder, tmp_path):
     """As where `kgs render` wrote into the folder of the photos."""
     out = tmp_path / "project"
     images = save(out / "images", planes()[:1], ["IMG_1.png"])
-    write_png(images / "render.png", torch.rand(3, 8, 8))
-    with writing(images, "renders", ["render.png"]):
-        pass
+    with replacing(images, "renders") as new:
+        write_png(new / "render.png", torch.rand(3, 8, 8))
     before = (images / "IMG_1.png").read_bytes()
     with pytest.raises(DataError, match="kgs did not write"):
         pose_photos(write_planes(folder), out)
     assert (images / "IMG_1.png").read_bytes() == before
 
 
-def test_new_cameras_wait_beside_the_fit_of_the_former_ones(folder, monkeypatch):
-    """Until the new fit is there `OUT` has a splat and the cameras that belong to it."""
-    out, found = folder.parent / "out", []
+@pytest.fixture
+def found(monkeypatch):
+    """The numbers of photos whose cameras were found, which takes no time."""
+    counts = []
 
     def find(opened, new, *_):
         paths = [photo.path for photo in opened]
-        found.append(len(paths))
+        counts.append(len(paths))
         (new / "images").mkdir()
         (new / "sparse" / "0").mkdir(parents=True)
         for path in paths:
@@ -279,28 +245,60 @@ def test_new_cameras_wait_beside_the_fit_of_the_former_ones(folder, monkeypatch)
             (new / "sparse" / "0" / f"{name}.bin").write_bytes(bytes([len(paths)]))
         return {"photos": {path.name: {"image": path.name} for path in paths}, "versions": {"kgs": "0"}}
 
+    monkeypatch.setattr(pose, "find_cameras", find)
+    return counts
+
+
+@pytest.mark.parametrize(
+    ("name", "kept"),
+    [
+        *((f"{name}/deeper/IMG_1.HEIC", "") for name in ("images", "sparse/0", "unfinished-1")),
+        *((name, "") for name in ("unfinished-1/notes.txt", "images/notes.txt", "checkpoint.safetensors")),
+        ("photos.json", "kept/photos.json"),
+        ("images", "kept/images"),
+        ("sparse/0/cameras.bin", "refused"),
+    ],
+)
+def test_a_users_own_files_stay(folder, tmp_path, found, name, kept):
+    """Also such as kgs does not read: HEIC photos, notes, checkpoints of another program."""
+    mine = tmp_path / "project" / name
+    mine.parent.mkdir(parents=True)
+    mine.write_bytes(b"mine")
+    if name.startswith("sparse"):
+        with pytest.raises(DataError, match="holds files of a scene"):
+            pose_photos(write_planes(folder), tmp_path / "project")
+    else:
+        pose_photos(write_planes(folder), tmp_path / "project")
+        assert len(list((tmp_path / "project" / "images").glob("*.png"))) == 3
+    assert (tmp_path / "project" / (kept or name) if kept != "refused" else mine).read_bytes() == b"mine"
+
+
+def test_new_cameras_wait_beside_the_fit_of_the_former_ones(folder, found):
+    """Until the new fit is there `OUT` has a splat and the cameras that belong to it."""
+    out = folder.parent / "out"
+    waiting = out / "unfinished-1"
+
     def placed():
         """How many photos the cameras in their place are of."""
         return (out / "sparse" / "0" / "cameras.bin").read_bytes()[0], len(list((out / "images").iterdir()))
 
-    monkeypatch.setattr(pose, "find_cameras", find)
     assert pose_photos(write_planes(folder), out, wait=True)["folder"] == str(out)
     assert placed() == (3, 3)
-    (out / "splat.ply").write_bytes(b"ply")
+    (out / "checkpoint.safetensors").write_bytes(b"of a fit")
     save(folder, planes()[:1, 20:], ["IMG_4.png"])
     for reused in (False, True):
         report = pose_photos(folder, out, wait=True)
-        assert (report["reused"], report["folder"]) == (reused, str(out / "finished-photos"))
+        assert (report["reused"], report["folder"]) == (reused, str(waiting))
         assert len(report["photos"]) == 4
         assert placed() == (3, 3)
-    photo_staging(out).complete()
+    publish(waiting, out, all_former=True)
     assert placed() == (4, 4)
-    assert not (out / "finished-photos").exists()
+    assert not waiting.exists()
     (folder / "IMG_4.png").unlink()
-    assert pose_photos(folder, out, wait=True)["folder"] == str(out / "finished-photos")
+    assert pose_photos(folder, out, wait=True)["folder"] == str(waiting)
     save(folder, planes()[:1, 20:], ["IMG_4.png"])
     assert pose_photos(folder, out, wait=True)["folder"] == str(out)  # those of the fit after all
-    assert not (out / "finished-photos").exists()
+    assert not waiting.exists()
     assert found == [3, 4, 3]
     (folder / "IMG_4.png").unlink()
     assert pose_photos(folder, out)["folder"] == str(out)
@@ -321,7 +319,7 @@ def test_a_full_disk_and_ctrl_c_leave_nothing_behind(folder, monkeypatch, refuse
 
     monkeypatch.setattr(f"kgs.app.sfm.{stage}", fail)
     refused(write_planes(folder), said, code=code)
-    assert [path.name for path in (folder.parent / "out").iterdir()] == [".lock"]
+    assert all(path.name in (".lock", ".kgs.lock") for path in (folder.parent / "out").iterdir())
 
 
 @pytest.mark.slow
@@ -330,11 +328,10 @@ def test_a_disk_that_is_full_when_a_database_is_written(folder, refused, size):
     """The first of two, in this process; and the second, in another one that it aborts."""
     with limited(size):
         said = refused(write_planes(folder), code=1).splitlines()
-    assert said[-1].removesuffix("/work: File too large").removesuffix(": File too large") == (
-        f"kgs: {folder.parent}/out/unfinished-photos"
-    )
+    assert said[-1].startswith(f"kgs: {folder.parent}/out/")
+    assert said[-1].endswith(": File too large")
     assert all(" of 3 " in line for line in said[:-1])  # how far the work was
-    assert [path.name for path in (folder.parent / "out").iterdir()] == [".lock"]
+    assert all(path.name in (".lock", ".kgs.lock") for path in (folder.parent / "out").iterdir())
 
 
 @pytest.mark.slow
@@ -349,7 +346,7 @@ def test_ctrl_c_while_keypoints_are_matched(folder, tmp_path):
         said = list(lines)
     assert said[-1] == NOT_FOUND
     assert not [line for line in said[:-1] if " of 3 " not in line]
-    assert [path.name for path in (tmp_path / "out").iterdir()] == [".lock"]
+    assert all(path.name in (".lock", ".kgs.lock") for path in (tmp_path / "out").iterdir())
 
 
 @pytest.mark.slow

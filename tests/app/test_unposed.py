@@ -11,7 +11,7 @@ from kornia.geometry.conversions import rotation_matrix_to_quaternion
 from kgs.app import sfm
 from kgs.app.cli.unposed import is_unposed
 from kgs.app.files.outputs import write_png
-from kgs.app.files.ownership import writing
+from kgs.app.files.publishing import enter
 from kgs.datasets import synthetic_scene
 from kgs.datasets.folders import nearest_scene
 from kgs.errors import DataError
@@ -69,9 +69,7 @@ def asked(truth, monkeypatch):
             "photo_size": [2 * width, 2 * height],
         }
         write_json(out / "photos.json", report | {"versions": {"kgs": "0"}})
-        written = [path for path in out.rglob("*") if path.is_file()]
-        with writing(out, "photos", [path.relative_to(out).as_posix() for path in written]):
-            pass
+        enter(out, "photos")
         return report | {"folder": str(out)}
 
     monkeypatch.setattr(sfm, "pose_photos", true_cameras)

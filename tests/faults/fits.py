@@ -16,12 +16,12 @@ import numpy as np
 from kgs.fit.config import FitConfig, Recipe
 from kgs.fit.plan import timetable
 
-__all__ = ["PATIENCE", "Fit", "memory_of"]
+__all__ = ["PATIENCE", "Fit", "memory_of", "start_command"]
 
 SIZE = (48, 64)
 PATIENCE = 300.0  # seconds after which a process is taken to hang
 _PROCESSES = multiprocessing.get_context("forkserver")  # which has imported what they need once for all of them
-_PROCESSES.set_forkserver_preload(["kgs.datasets", "kgs.app.fit_folder", "torch._dynamo", "trimesh"])
+_PROCESSES.set_forkserver_preload(["kgs.datasets", "kgs.app.fit_folder", "torch._dynamo", "trimesh", "tyro"])
 
 
 def _config(steps: int, points: Path, **changes: Any) -> FitConfig:
@@ -102,6 +102,24 @@ def _fit(fit: Fit, limit: int | None) -> None:
         os._exit(1)  # as the command does, with one line
     if published.signal:
         os._exit(128 + published.signal)
+
+
+def start_command(*words: object) -> BaseProcess:
+    """Start `kgs` with these words in a process of its own."""
+    process = _PROCESSES.Process(target=_command, args=tuple(map(str, words)))
+    process.start()
+    return process
+
+
+def _command(*words: str) -> None:
+    import torch
+
+    from kgs.app.cli.run import exit_code
+
+    torch.set_num_threads(1)
+    for stream in (1, 2):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
+    os._exit(exit_code(list(words)))
 
 
 def memory_of(folder: Path, steps: int) -> tuple[float, int, int]:

@@ -18,7 +18,7 @@ import pytest
 if sys.platform != "linux":
     pytest.skip("limits and signals of POSIX, memory from /proc", allow_module_level=True)
 
-from fits import PATIENCE, Fit, memory_of
+from fits import PATIENCE, Fit, memory_of, start_command
 
 from kgs.app.files.results_folder import CHECKPOINT
 from kgs.errors import DataError
@@ -56,7 +56,7 @@ def test_kill_9_at_random_moments(alone: tuple[int, bytes], tmp_path: Path, reco
     steps, expected = alone
     trials, longest = (30, 0.6) if steps == LONG else (1, 0.1)
     fit, moments = Fit(tmp_path, "killed", steps), random.Random(0)
-    path, corrupt, fallen_back, different, fits, kills = fit.out / "unfinished" / CHECKPOINT, 0, 0, 0, 0, 0
+    path, corrupt, fallen_back, different, fits, kills = fit.out / "unfinished-1" / CHECKPOINT, 0, 0, 0, 0, 0
     while kills < trials:
         process = fit.start()
         if fit.wait_for_steps(process):
@@ -85,6 +85,67 @@ def test_kill_9_at_random_moments(alone: tuple[int, bytes], tmp_path: Path, reco
     record("kill -9 at a random moment", trials, corrupt, found, corrupt == different == 0)
 
 
+@pytest.fixture(scope="module")
+def fitted(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The results of a fit of the scene `folder`."""
+    out = tmp_path_factory.mktemp("fitted") / "out"
+    few = ("--steps", 12, "--init", "random", "--init-points", 200)
+    process = start_command("fit", folder, "-o", out, *few)
+    process.join(PATIENCE)
+    assert process.exitcode == 0
+    return out
+
+
+# A command, and a file that it writes, where a user has put another one; SCENE and OUT are folders.
+COMMANDS = {
+    "fit": ("fit SCENE -o OUT --steps 12 --init random --init-points 200", "splat.ply"),
+    "eval": ("eval OUT", "index.html"),
+    "page": ("page OUT/splat.ply --cameras SCENE -o OUT/more/a.html", "more/a.html"),
+    "clean": ("clean OUT -o OUT/more/clean.ply", "more/clean.ply"),
+    "scale": ("scale OUT --by 0,0,0 0,0,1 2 -o OUT/more", "more/splat.ply"),
+    "export": ("export OUT/splat.ply -o OUT/more/a.compressed.ply", "more/a.compressed.ply"),
+    "render": ("render OUT/splat.ply --cameras SCENE -o OUT/more", "more/train_r_0.png"),
+    "demo": ("demo -o OUT/more --steps 3 --size 24 32", "more/splat.ply"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", COMMANDS)
+def test_kill_9_of_each_command(
+    command: str, folder: Path, fitted: Path, tmp_path: Path, record: Callable[..., None]
+) -> None:
+    """Killed at a random moment, then run again: what the user wrote is kept, and all results are there."""
+    line, name = COMMANDS[command]
+    trials = 30
+    moments = random.Random(0)
+    seconds = 0.0
+    lost = 0
+    for trial in range(trials + 1):
+        out = tmp_path / str(trial)
+        shutil.copytree(fitted, out)
+        (out / "more").mkdir()
+        words = [word.replace("SCENE", str(folder)).replace("OUT", str(out)) for word in line.split()]
+        mine = out / name
+        mine.write_text("mine")
+        start = time.monotonic()
+        if trial:  # the first one is left alone
+            process = start_command(*words)
+            time.sleep(moments.uniform(0.0, seconds))
+            process.kill()
+            process.join(PATIENCE)
+        kept = mine.parent / "kept" / mine.name if command not in ("fit", "eval") else out / "kept" / name
+        lost += sum(path.exists() and path.read_bytes() == b"mine" for path in (mine, kept)) != 1
+        process = start_command(*words)
+        process.join(PATIENCE)
+        seconds = seconds or time.monotonic() - start
+        lost += process.exitcode != 0 or kept.read_text() != "mine" or mine.read_bytes() == b"mine"
+        left = [path for path in out.rglob("*") if path.is_dir() and path.name.startswith((".kgs-", "unfinished-"))]
+        lost += any(left) or len(list(mine.parent.glob("kept*"))) != 1
+        shutil.rmtree(out)
+    found = f"{lost} times a file of the user lost, or a result, or a folder left"
+    record(f"kill -9 of kgs {command}", trials, lost, found, lost == 0)
+
+
 @pytest.mark.slow  # test_run.py has the signals in one process
 def test_sigterm(alone: tuple[int, bytes], tmp_path: Path, record: Callable[..., None]) -> None:
     fit = Fit(tmp_path, "terminated", alone[0])
@@ -106,7 +167,7 @@ def test_full_disk(alone: tuple[int, bytes], tmp_path: Path, record: Callable[..
     process.join(PATIENCE)
     code = process.exitcode
     try:
-        step = newest_checkpoint(fit.out / "unfinished" / CHECKPOINT)[0]["step"]
+        step = newest_checkpoint(fit.out / "unfinished-1" / CHECKPOINT)[0]["step"]
     except DataError:
         step = -1
     partial = [path.name for path in fit.out.rglob("*.partial")]

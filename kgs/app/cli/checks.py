@@ -25,22 +25,14 @@ def check_roll(roll: float) -> None:
         raise ValueError(f"roll: expected degrees in [-360, 360], got {roll}")
 
 
-def check_file(out: Path, ending: str, command: str, source: Path | None = None) -> None:
-    """Raise a ValueError or DataError unless a command can write its result to this file.
-
-    A file that is there has to be a former result of the same command, and not the file `source` that it reads.
-    """
-    from kgs.app.files.ownership import is_own, read_list
-
+def check_file(out: Path, ending: str, source: Path | None = None) -> None:
+    """Raise a ValueError or DataError unless a command can write its result to this file, which is not `source`."""
     if out.suffix.lower() != ending:
         raise ValueError(f"out: expected a file that ends in {ending}, got {str(out)!r}")
-    if out.exists():
-        if source is not None and out.samefile(source):
-            raise ValueError(f"out: expected another file than {str(source)!r}, which is read")
-        if not is_own(out) or out.name not in read_list(out.parent).get(command, {}):
-            raise DataError(
-                out, "", f"is no former result of kgs {command}, and would be overwritten: choose another file"
-            )
+    if out.is_dir():
+        raise DataError(out, "", "expected a file, found a folder of this name")
+    if source is not None and out.exists() and out.samefile(source):
+        raise ValueError(f"out: expected another file than {str(source)!r}, which is read")
     if not out.absolute().parent.is_dir():
         raise DataError(out, "", "expected a file in a folder that is there")
 
@@ -89,17 +81,16 @@ def check_scene(scene: Path) -> None:
 
 def check_results(out: Path) -> None:
     """Raise a DataError unless this is the folder of the results of a fit."""
-    from kgs.app.files.staging import Staging
+    from kgs.app.files.publishing import complete, unpublished
     from kgs.json_files import read_json
 
-    staging = Staging(out)
+    complete(out)
     config = out / "config.json"
-    if not staging.finished.exists():
-        if not config.exists() and staging.unfinished.exists():
-            raise DataError(out, "", "holds a fit that is not done: kgs fit --resume goes on with it")
-        if not config.exists():
-            raise DataError(config, "", "cannot be read: expected the folder of the results of kgs fit")
-        read_json(config)
+    if not config.exists() and unpublished(out, "fit"):
+        raise DataError(out, "", "holds a fit that is not done: kgs fit --resume goes on with it")
+    if not config.exists():
+        raise DataError(config, "", "cannot be read: expected the folder of the results of kgs fit")
+    read_json(config)
 
 
 def check_photos(folder: Path, out: Path, views: int | None, hold_out: int | None, downscale: float | None) -> None:

@@ -52,7 +52,7 @@ def clean(
         device: cpu, cuda, ...
         backend: auto: that of the fit, or the fastest that is installed. kgs fit --help-all describes the others.
     """
-    from kgs.app.files.ownership import writing
+    from kgs.app.files.publishing import replacing
     from kgs.app.saved_fit import load_fit
     from kgs.fit.clean import check_left, check_strength, find_strays
     from kgs.fit.clean import clean as clean_fit
@@ -84,8 +84,8 @@ def clean(
         check_left(len(model))
         removed = strays.counts(strays.any)
         fitted = len(whole)
-    with writing(out.parent, "clean", [out.name]):
-        save_ply(out, model, offset=offset)
+    with replacing(out.parent, "clean") as new:
+        save_ply(new / out.name, model, offset=offset)
     kinds = ", ".join(f"{count} {kind}" for kind, count in removed.items())
     say(f"{printable(out)}: {len(model)} of {fitted} Gaussians; removed: {kinds}")
     if fit is None:
@@ -157,7 +157,7 @@ def check_clean(
 
     check_options(downscale, None)
     check_installed(device, backend)
-    check_file(out, ".ply", "clean", splat)
+    check_file(out, ".ply", splat)
     if cameras is not None:
         check_scene(cameras)
     if splat.is_dir():

@@ -49,7 +49,7 @@ def demo(
 
     config = replace(DEMO, seed=seed, steps=steps, device=device, backend=backend)
     check_tools(device, backend, "jinja2")
-    check_folder(out, _files())
+    check_folder(out)
     scene = synthetic_scene("room", train_views=3, test_views=3, size=size, seed=seed)
     runs = run_demo(scene, config, out, {"without": 0.0, "with": DROP} if compare else {"with": DROP})
     say(f"\n{'':22}{'PSNR':>8}{'SSIM':>8}{'train PSNR':>12}{'Gaussians':>11}{'seconds':>9}")
@@ -75,7 +75,7 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, floa
     """
     from kgs.app.files.exports import write_exports
     from kgs.app.files.figures import write_curve, write_sheet
-    from kgs.app.files.staging import Staging
+    from kgs.app.files.publishing import replacing
     from kgs.app.fit_folder import train
     from kgs.app.page.fit_page import PAGE, write_fit_page
     from kgs.fit.measures import measure
@@ -101,27 +101,23 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, floa
             raise SystemExit(128 + signal)
         runs[name] = measure(fit)
         fits[title] = replace(fit, metrics=runs[name])
-    staging = Staging(out, "demo")
-    staging.start()
-    folder = staging.unfinished
-    save_ply(folder / "splat.ply", fit.model, offset=scene.offset)
-    for note in write_exports(fit, folder):
-        say(note)
-    write_json(folder / "metrics.json", runs)
-    write_curve(folder / "curve.png", {title: one.history["curve"] for title, one in fits.items()})
     levels = list(map(_level, runs[name]["test"]["views"]))
     worst = sorted(range(len(levels)), key=levels.__getitem__)[:2]
     cameras = [scene.test.camera(i) for i in range(len(scene.test))]
     renders = {title: [one.render(camera)[0] for camera in cameras] for title, one in fits.items()}
-    write_sheet(folder / "demo.png", scene.test, renders, sorted(worst))
-    write_fit_page(
-        folder / PAGE,
-        "kgs demo",
-        fits,
-        notes=[f"The viewer and the sliders show the fit {title}."] if len(runs) > 1 else [],
-    )
-    staging.seal()
-    staging.complete()
+    with replacing(out, "demo", all_former=True) as new:
+        save_ply(new / "splat.ply", fit.model, offset=scene.offset)
+        for note in write_exports(fit, new):
+            say(note)
+        write_json(new / "metrics.json", runs)
+        write_curve(new / "curve.png", {title: one.history["curve"] for title, one in fits.items()})
+        write_sheet(new / "demo.png", scene.test, renders, sorted(worst))
+        write_fit_page(
+            new / PAGE,
+            "kgs demo",
+            fits,
+            notes=[f"The viewer and the sliders show the fit {title}."] if len(runs) > 1 else [],
+        )
     return runs
 
 
@@ -133,7 +129,7 @@ def _level(measures: dict[str, Any]) -> float:
 def check_demo(out: Path, size: tuple[int, int], steps: int, device: str, backend: str, **_: Any) -> None:
     """Check the arguments of `kgs demo`."""
     from kgs.app.files.outputs import check_folder
-    from kgs.app.files.ownership import read_list
+    from kgs.app.files.publishing import read_marker
 
     from .checks import check_installed
 
@@ -141,16 +137,6 @@ def check_demo(out: Path, size: tuple[int, int], steps: int, device: str, backen
     if min(size) < 12:  # the window of SSIM
         raise ValueError(f"size: expected at least 12 pixels a side, got {size[0]} {size[1]}")
     check_installed(device, backend, "jinja2")
-    check_folder(out, _files(), make=False)
-    if "fit" in read_list(out):
+    check_folder(out, make=False)
+    if "fit" in read_marker(out):
         raise DataError(out, "", "holds the results of kgs fit: choose another folder")
-
-
-def _files() -> list[str]:
-    """The files and folders that the demo writes."""
-    from kgs.app.files.outputs import EXPORTS
-    from kgs.app.files.staging import Staging
-
-    staging = Staging(Path(), "demo")
-    folders = [staging.unfinished.name, staging.finished.name]
-    return ["index.html", "demo.png", "curve.png", "metrics.json", "splat.ply", *EXPORTS, *folders]

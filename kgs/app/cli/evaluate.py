@@ -28,8 +28,7 @@ def evaluate(
         device: cpu, cuda, ...
         backend: auto: that of the fit. kgs fit --help-all describes the others.
     """
-    from kgs.app.files.outputs import NOT_OWN
-    from kgs.app.files.ownership import is_own, writing
+    from kgs.app.files.publishing import replacing
     from kgs.app.page.fit_page import PAGE, write_own_page
     from kgs.app.saved_fit import load_fit
     from kgs.json_files import read_json, write_json
@@ -42,18 +41,12 @@ def evaluate(
     request, fit = load_fit(out, device, backend, say)
     path = out / "metrics.json"
     metrics = measure_again(path, fit.metrics, fit.scene, fit.render, lpips)
-    has_own_page = is_own(out / PAGE) or not (out / PAGE).exists()
-    written = [path.name, PAGE] if has_own_page else [path.name]
     if read_json(path) != fit.metrics:
         raise DataError(out, "", "a new fit took the place of the one that was measured: measure again")
-    with writing(out, "fit", written):
-        write_json(path, metrics)
-        if has_own_page:
-            write_own_page(out, out, replace(fit, metrics=metrics), request)
+    with replacing(out, "fit") as new:
+        write_json(new / path.name, metrics)
+        write_own_page(new, out, replace(fit, metrics=metrics), request, config=out / "config.json")
     say(as_text(metrics))
-    if not has_own_page:
-        say(f"{printable(path)} is up to date; {printable(out / PAGE)} {NOT_OWN}, and is kept")
-        return
     say(f"{printable(path)} and {printable(out / PAGE)} are up to date")
     say_next(f"open {as_line(out / PAGE)} in a browser")
 

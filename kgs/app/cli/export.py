@@ -33,7 +33,7 @@ def export(
     """
     import torch
 
-    from kgs.app.files.ownership import writing
+    from kgs.app.files.publishing import replacing
     from kgs.compressed_ply import save_compressed_ply
     from kgs.errors import DataError
     from kgs.ply import load_ply
@@ -41,8 +41,8 @@ def export(
     model = load_ply(ply, torch.tensor(origin, dtype=torch.float64))
     if not len(model):
         raise DataError(ply, "vertex", "expected at least one Gaussian, got none")
-    with writing(out.parent, "export", [out.name]):
-        save_compressed_ply(out, model)
+    with replacing(out.parent, "export") as new:
+        save_compressed_ply(new / out.name, model)
     sizes = [path.stat().st_size / 1e6 for path in (out, ply)]
     say(f"{printable(out)}: {len(model)} Gaussians, {sizes[0]:.2f} MB of {sizes[1]:.2f}")
     say_next(VIEWER.format(as_line(out)))
@@ -53,4 +53,4 @@ def check_export(ply: Path, out: Path, **_: Any) -> None:
     from .checks import check_file, check_installed
 
     check_installed("cpu", "auto")
-    check_file(out, ".ply", "export", ply)
+    check_file(out, ".ply", ply)

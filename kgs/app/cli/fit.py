@@ -87,13 +87,12 @@ def fit(
         live: show the splat as it grows on a page on this machine, until the fit ends; a line says its address.
         config: every number of the fit.
     """
-    from kgs.app.files.ownership import is_own
+    from kgs.app.files.publishing import read_marker
     from kgs.app.fit_folder import fit_folder
     from kgs.app.scene_request import SceneRequest
     from kgs.app.stages import Stages
     from kgs.datasets import load_scene
     from kgs.datasets.field import field_size
-    from kgs.datasets.folders import CAMERAS_REPORT
     from kgs.fit.prune import left_out
     from kgs.machine import check_packages
     from kgs.metrics.evaluate import as_text
@@ -131,7 +130,7 @@ def fit(
         stages.begin("cameras")
         assert not isinstance(size, str)  # refused before
         request, base = find_scene(scene, out, request, config.seed, size, frames)
-    elif is_own(out / CAMERAS_REPORT):
+    elif read_marker(out).get("photos"):
         raise DataError(out, "", "holds cameras that kgs found for other photos: choose another folder")
     elif size == "field":
         photo_folder, factor, why = field_size(scene)
@@ -192,7 +191,6 @@ def check_fit(
 ) -> None:
     """Check the arguments of `kgs fit`."""
     from kgs.app.files.outputs import check_folder
-    from kgs.app.files.results_folder import replaced_files
     from kgs.app.sfm.find import FEWEST, find_video
     from kgs.datasets.options import check_options
     from kgs.metrics.weights import weight_files
@@ -221,7 +219,7 @@ def check_fit(
     check_installed(config.device, config.backend, "safetensors", "jinja2", *solver)
     if lpips_weights is not None:
         weight_files(lpips_weights)
-    check_folder(out, replaced_files(out), scene, make=False)
+    check_folder(out, scene, make=False)
     if unposed:
         check_photos(scene, out, views, hold_out, downscale)
     else:

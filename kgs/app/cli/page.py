@@ -46,7 +46,7 @@ def page(
         device: cpu, cuda, ...
         backend: auto: the fastest that is installed. kgs fit --help-all describes the others.
     """
-    from kgs.app.files.ownership import writing
+    from kgs.app.files.publishing import replacing
     from kgs.app.page.fit_page import MOST_PICTURES, load_small, spread, write_fit_page
     from kgs.datasets import load_scene
     from kgs.losses.photometric import WINDOW
@@ -63,9 +63,9 @@ def page(
     photographed = load_scene(cameras, len(few), downscale, hold_out=0, background=background)
     pictured = in_frame_of(scene, photographed)
     fit = replace(fit, metrics={"views": evaluate(fit.render, pictured), "versions": versions()})
-    with writing(out.parent, "page", [out.name]):
+    with replacing(out.parent, "page") as new:
         cost = write_fit_page(
-            out,
+            new / out.name,
             f"{ply.stem}, {Path(cameras).resolve().name}",
             {"": fit},
             beside=pictured,
@@ -106,5 +106,5 @@ def check_page(
     check_roll(roll)
     check_options(downscale, None)
     check_installed(device, backend, "jinja2")
-    check_file(out, ".html", "page")
+    check_file(out, ".html")
     check_scene(cameras)

@@ -43,7 +43,7 @@ def render(
 
     from kgs.app.files.cameras import as_taken
     from kgs.app.files.outputs import check_folder, png_names, write_png
-    from kgs.app.files.ownership import writing
+    from kgs.app.files.publishing import replacing
     from kgs.camera import move_camera
     from kgs.machine import check_tools
     from kgs.renderer import GaussianRenderer
@@ -54,16 +54,16 @@ def render(
     fit = load_splat(ply, scene, place, backend)
     renderer = GaussianRenderer(options=fit.options, backend=backend).eval()
     names = png_names(scene.train.names)
-    check_folder(out, names.values(), scene.root)
+    check_folder(out, scene.root)
     color = scene.background.to(place)
     outputs = ("image", "alpha") if is_transparent else ("image",)
-    with writing(out, "renders", names.values()), torch.no_grad():
+    with replacing(out, "renders") as new, torch.no_grad():
         for i, name in each(list(enumerate(scene.train.names)), "pictures", "view"):
             rendering = renderer(fit.model(), move_camera(scene.train.camera(i), place), color, outputs)
             image = rendering.image
             if is_transparent:  # PNG's colours are not multiplied by alpha
                 image = torch.cat([image / rendering.alpha.clamp_min(1e-6), rendering.alpha], 1)
-            write_png(out / names[name], as_taken(image[0], scene.train, i))
+            write_png(new / names[name], as_taken(image[0], scene.train, i))
     say(f"{len(names)} pictures in {printable(out)}")
     say_next(VIEWER.format(as_line(ply)))
 
@@ -77,5 +77,5 @@ def check_render(cameras: Path, out: Path, downscale: float | None, device: str,
 
     check_options(downscale, None)
     check_installed(device, backend)
-    check_folder(out, (), cameras, make=False)
+    check_folder(out, cameras, make=False)
     check_layout(cameras)

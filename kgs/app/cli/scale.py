@@ -12,8 +12,6 @@ from .options import Existing, Out
 if TYPE_CHECKING:
     from torch import Tensor
 
-_FILES = ("splat.ply", "splat.compressed.ply", "splat.glb", "cameras.json", "index.html")
-
 
 def scale(splat: Existing, /, *, by: tuple[str, str, float], out: Out) -> None:
     """Scale a splat and its cameras, so that two points are a known length apart.
@@ -47,7 +45,7 @@ def _scale_folder(folder: Path, out: Path, factor: float, length: float) -> None
     """Write the files of a fit in the new unit; the fit stays as it is."""
     from kgs.app.files.exports import write_splat_exports
     from kgs.app.files.outputs import check_folder
-    from kgs.app.files.ownership import writing
+    from kgs.app.files.publishing import replacing
     from kgs.app.page.fit_page import write_own_page
     from kgs.app.saved_fit import load_fit
     from kgs.fit.scale import scaled
@@ -58,22 +56,22 @@ def _scale_folder(folder: Path, out: Path, factor: float, length: float) -> None
     request, fit = load_fit(folder, say=say)
     fit = scaled(fit, factor)
     note = f"The splat was scaled by {factor:.6g} after the fit, for a length of {length:g}; settings are those before."
-    check_folder(out, _FILES, fit.scene.root)
-    with writing(out, "scale", _FILES):
-        save_ply(out / "splat.ply", fit.model, offset=fit.scene.offset)
-        write_splat_exports(fit, out, request.roll)
-        write_own_page(out, folder, fit, request, config=folder / "config.json", remarks=[note])
+    check_folder(out, fit.scene.root)
+    with replacing(out, "scale", all_former=True) as new:
+        save_ply(new / "splat.ply", fit.model, offset=fit.scene.offset)
+        write_splat_exports(fit, new, request.roll)
+        write_own_page(new, folder, fit, request, config=folder / "config.json", remarks=[note])
 
 
 def _scale_ply(ply: Path, out: Path, factor: float, near: "Tensor") -> None:
     """Write a scaled PLY file; positions are read relative to a point near them, because float32 holds few digits."""
-    from kgs.app.files.ownership import writing
+    from kgs.app.files.publishing import replacing
     from kgs.fit.scale import scaled_model
     from kgs.ply import load_ply, save_ply
 
     model = scaled_model(load_ply(ply, origin=near), factor)
-    with writing(out.parent, "scale", [out.name]):
-        save_ply(out, model, offset=factor * near)
+    with replacing(out.parent, "scaled") as new:
+        save_ply(new / out.name, model, offset=factor * near)
 
 
 def _point(text: str) -> list[float]:
@@ -90,7 +88,7 @@ def _point(text: str) -> list[float]:
 def check_scale(splat: Path, by: tuple[str, str, float], out: Path, **_: Any) -> None:
     """Check the arguments of `kgs scale`."""
     from kgs.app.files.outputs import check_folder
-    from kgs.app.files.ownership import read_list
+    from kgs.app.files.publishing import read_marker
 
     from .checks import check_file, check_installed, check_results
 
@@ -103,9 +101,9 @@ def check_scale(splat: Path, by: tuple[str, str, float], out: Path, **_: Any) ->
     if splat.is_dir():
         check_installed("cpu", "auto", "jinja2", "safetensors")
         check_results(splat)
-        check_folder(out, _FILES, make=False)
-        if "fit" in read_list(out):
+        check_folder(out, make=False)
+        if "fit" in read_marker(out):
             raise DataError(out, "", "holds the results of kgs fit: choose another folder")
         return
     check_installed("cpu", "auto")
-    check_file(out, ".ply", "scale", splat)
+    check_file(out, ".ply", splat)

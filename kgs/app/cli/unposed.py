@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kgs.app.console import each, say
-from kgs.app.files.results_folder import complete_stopped_move
 from kgs.datasets.folders import VIDEO_SUFFIXES, nearest_scene
 
 if TYPE_CHECKING:
@@ -44,7 +43,6 @@ def find_scene(
     from kgs.app.sfm import pose_photos
     from kgs.app.sfm.find import find_video, notes_on
 
-    complete_stopped_move(out)  # with its cameras, before others wait in their place
     video = find_video(photos)
     for note in () if video else notes_on(photos):
         say(note)

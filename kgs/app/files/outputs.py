@@ -1,4 +1,4 @@
-"""Checks the folder of a command's results, and writes PNGs; a user's file is never overwritten."""
+"""Checks the folder of a command's results, and writes PNGs."""
 
 import hashlib
 import os
@@ -9,11 +9,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kgs.datasets.folders import CAMERAS_REPORT, LAYOUT_FILES, list_images
+from kgs.datasets.folders import LAYOUT_FILES, list_images
 from kgs.errors import DataError
 from kgs.json_files import write_whole
 
-from .ownership import is_own
+from .publishing import is_own, read_marker
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -21,32 +21,27 @@ if TYPE_CHECKING:
 FILMS = ("turntable.mp4", "turntable.webm")  # a fit writes one of them
 # for other programs, and for messengers
 EXPORTS = ("cameras.json", "splat.compressed.ply", "splat.glb", "preview.jpg", *FILMS)
-NOT_OWN = "was not written by kgs, or was changed since (it knows its files by size and time: copy folders with cp -a)"
 _SCENES = ("sparse", *LAYOUT_FILES.values())
 _ENDING = r"(?<=[^./\\])\.[^./\\]*$"  # of a view's name; the name of a hidden file is no ending
 _LONGEST = 120  # bytes of a picture's name
 
 
-def check_folder(out: Path, files: Iterable[str], scene: Path | None = None, make: bool = True) -> None:
-    """Create the folder for results, after checking that it can be written to and that no user's file is in the way.
+def check_folder(out: Path, scene: Path | None = None, make: bool = True) -> None:
+    """Create the folder for results, after checking that it can be written to and holds no scene of the user.
 
-    `files`, relative to `out`, are the files that will be written; nothing is written next to the photos of the folder
-    `scene`. With `make` False the folder is only checked. A folder that cannot be used is a DataError.
+    Nothing is written next to the photos of the folder `scene`. With `make` False the folder is only checked. A folder
+    that cannot be used is a DataError.
     """
-    advice = "choose another folder"
     there = next(path for path in (out, *out.absolute().parents) if os.path.lexists(path))
     if not there.is_dir():
         raise DataError(out, "", f"expected a folder for results, but {there} is none")
     if not os.access(there, os.W_OK | os.X_OK):
         raise DataError(out, "", f"results cannot be written there: no permission for {there}")
     inside = scene is not None and out.resolve().is_relative_to(scene.resolve())
-    has_photos = inside and there == out and not all(map(is_own, list_images(out)))
-    of_photos = ("sparse",) if is_own(out / CAMERAS_REPORT) else ()  # kgs wrote it: cameras that a former run found
+    has_photos = inside and there == out and not all(is_own(out, path.name) for path in list_images(out))
+    of_photos = ("sparse",) if read_marker(out).get("photos") else ()  # cameras that a former run found
     if has_photos or any((out / name).exists() for name in _SCENES if name not in of_photos):
-        raise DataError(out, "", f"holds files of a scene: {advice}")
-    for path in (out / name for name in files):
-        if (os.path.lexists(path) and not is_own(path)) or (os.path.lexists(path.parent) and not path.parent.is_dir()):
-            raise DataError(path, "", f"{NOT_OWN}, and would be overwritten: {advice}")
+        raise DataError(out, "", "holds files of a scene: choose another folder")
     if make:
         out.mkdir(parents=True, exist_ok=True)
 

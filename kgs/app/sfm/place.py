@@ -1,16 +1,11 @@
-"""Where photos and cameras go: `images`, `masks`, `sparse/0` and `photos.json` in a folder, all or none.
+"""Where photos and cameras go: `images`, `masks`, `sparse/0` and `photos.json` in a folder."""
 
-New ones go through `unfinished-photos` and `finished-photos`, see `Staging`. Beside a fit, which belongs to the former
-cameras, they wait in the second folder until the new fit is there.
-"""
-
-import os
 from pathlib import Path
 from typing import Any
 
-from kgs.app.files.ownership import holds_only_own, is_own
-from kgs.app.files.results_folder import photo_staging
-from kgs.datasets.folders import CAMERAS_REPORT
+from kgs.app.files.outputs import check_folder
+from kgs.app.files.publishing import read_marker
+from kgs.datasets.folders import CAMERAS_REPORT, list_images
 from kgs.errors import DataError
 from kgs.json_files import read_json
 
@@ -21,17 +16,15 @@ MODEL = "sparse/0"
 
 
 def check_place(out: Path, folder: Path) -> None:
-    """Raise a DataError if results would lie among the user's photos, or replace files that kgs did not write."""
-    advice = "choose another folder"
+    """Raise a DataError if results would lie among the user's photos, or in the folder of another scene."""
     photos = folder.resolve()
-    staging = photo_staging(out)
     results = [out / IMAGES, out / MASKS, out / "sparse"]
-    temporary = [staging.unfinished, staging.finished]
-    if photos == out.resolve() or any(photos.is_relative_to(path.resolve()) for path in [*results, *temporary]):
-        raise DataError(out, "", f"holds the photos themselves: {advice}")
-    for path in filter(os.path.lexists, [*results, *temporary]):
-        if not (holds_only_own(path) or (path in temporary and is_own(path))):
-            raise DataError(path, "", f"holds files of a scene that kgs did not write: {advice}")
+    if photos == out.resolve() or any(photos.is_relative_to(path.resolve()) for path in results):
+        raise DataError(out, "", "holds the photos themselves: choose another folder")
+    is_own = bool(read_marker(out).get("photos"))
+    if not is_own and any(path.is_dir() and list_images(path) for path in results):
+        raise DataError(out, "", "holds photos that kgs did not write: choose another folder")
+    check_folder(out, folder, make=False)
 
 
 def is_reusable(out: Path, inputs: dict[str, Any]) -> bool:

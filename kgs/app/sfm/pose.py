@@ -15,8 +15,10 @@ import cv2
 import torch
 
 from kgs.app.console import say
+from kgs.app.files.locks import locked
 from kgs.app.files.outputs import png_names
-from kgs.app.files.results_folder import locked, photo_staging
+from kgs.app.files.publishing import begin, complete, discard, publish, replacing, unpublished
+from kgs.app.files.results_folder import resumable_fits
 from kgs.datasets.masks import mask_folder
 from kgs.errors import DataError
 from kgs.json_files import read_json, write_json
@@ -69,7 +71,8 @@ def pose_photos(
             is black is not matched, and `out` gets the masks in `masks`.
         seed: of the solvers. The same photos and seed give the same files, but for the times in photos.json.
         frames: the number of frames that are taken from a video; see :func:`kgs.app.sfm.video.take_frames`.
-        wait: leave new files in `out/finished-photos` if `out` holds a fit, which belongs to the former cameras.
+        wait: leave new files in a folder of their own in `out` if `out` holds a fit, which belongs to the former
+            cameras.
         bar: wraps the loops to show their progress, see :mod:`kgs.progress`.
         say: called with each line for the user.
 
@@ -104,30 +107,30 @@ def pose_photos(
     }
     out.mkdir(parents=True, exist_ok=True)
     with locked(out):
-        staging = photo_staging(out)
-        waiting = staging.finished
-        if not (wait and staging.is_waiting):
-            staging.complete()
-        place = next((place for place in (waiting, out) if is_reusable(place, inputs)), None)
-        if place is not None:
-            say(f"cameras: those in {place} are of the same {len(paths)} photos and are used again")
-        if place == out:
-            staging.discard()
-        if place is None:
-            new = staging.unfinished
-            staging.start()
+        complete(out, say)
+        waiting = unpublished(out, "photos")
+        posed = next((place for place in (*waiting, out) if is_reusable(place, inputs)), None)
+        is_reused = posed is not None
+        if posed is None:
+            posed = begin(out, "photos")
             try:
-                write_json(new / REPORT, inputs | find_cameras(opened, new, seed % 2**31, bar, say))
-                staging.seal()
-            finally:
-                shutil.rmtree(new, ignore_errors=True)
-        if not (wait and (out / "splat.ply").exists()):
-            staging.complete()
-        posed = waiting if staging.is_waiting else out
+                with replacing(posed, "photos") as new:
+                    write_json(new / REPORT, inputs | find_cameras(opened, new, seed % 2**31, bar, say))
+            except BaseException:
+                discard(posed)
+                raise
+        else:
+            say(f"cameras: those in {posed} are of the same {len(paths)} photos and are used again")
+        for other in waiting:
+            if other != posed:
+                discard(other)
+        if posed != out and not (wait and resumable_fits(out)):
+            publish(posed, out, all_former=True, say=say)
+            posed = out
         report = read_json(posed / REPORT)
-        if place is not None:
+        if is_reused:
             say_left_out(report.get("left_out", {}), say)
-        return {**report, "reused": place is not None, "folder": str(posed)}
+        return {**report, "reused": is_reused, "folder": str(posed)}
 
 
 def _pose_video(video: Path, out: Path, frames: int | None, options: dict[str, Any]) -> dict[str, Any]:

@@ -1,0 +1,250 @@
+"""Whose file it is, and how new results get to their places; docs/command.md states the rules.
+
+A folder of results has a marker, `.kgs.json`: the SHA-256 of what kgs wrote there, by kind of result and name. New
+results are written to a folder of their own below it, which has a marker, too. `publish` moves them to their places;
+after a kill the next command that opens the folder ends the move (`complete`).
+"""
+
+import hashlib
+import os
+import shutil
+import uuid
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from itertools import count
+from pathlib import Path, PurePath
+from typing import Any
+
+from kgs.app.console import say
+from kgs.errors import DataError, listed, printable
+from kgs.json_files import read_json, write_json
+
+from .locks import held
+
+MARKER = ".kgs.json"
+KEPT = "kept"
+_UNFINISHED = "unfinished-"  # and a number: a folder of new results that outlives its process
+_HIDDEN = ".kgs-"  # and a random name: one that does not
+_LOCK = ".lock"
+_MARKER_LOCK = ".kgs.lock"
+_TEMPORARY = (".partial", ".tmp")
+_MOST_NAMED = 10  # files in a line
+Hashes = dict[str, list[str]]  # of each file that kgs wrote; two where new results are about to replace former ones
+Say = Callable[[str], None]
+
+
+def begin(out: Path, kind: str) -> Path:
+    """Make a folder for new results in `out`: `unfinished-1`, or the next number whose name is free."""
+    out.mkdir(parents=True, exist_ok=True)
+    with _marker_lock(out):
+        work = next(path for number in count(1) if not os.path.lexists(path := out / f"{_UNFINISHED}{number}"))
+        work.mkdir()
+        _write_marker(work, {kind: {}})
+    return work
+
+
+@contextmanager
+def replacing(out: Path, kind: str, all_former: bool = False, say: Say = say) -> Iterator[Path]:
+    """A hidden folder for new files, which take their places in `out` when the block ends; see `publish`.
+
+    After an error in the block `out` is as it was.
+    """
+    complete(out, say)
+    with ExitStack() as lock:
+        with _marker_lock(out):
+            work = out / f"{_HIDDEN}{uuid.uuid4().hex}"
+            work.mkdir()
+            lock.enter_context(held(work / _LOCK))
+        try:
+            yield work
+            enter(work, kind)
+        except BaseException:
+            shutil.rmtree(work, ignore_errors=True)
+            raise
+        publish(work, out, all_former, say)
+
+
+def enter(work: Path, kind: str, names: Iterable[str] | None = None) -> None:
+    """Enter files of a folder of new results in its marker, as they are now: these if they are there, or all."""
+    former = {name: shas for name, shas in read_marker(work).get(kind, {}).items() if (work / name).is_file()}
+    there = _files(work) if names is None else [name for name in names if (work / name).is_file()]
+    _write_marker(work, {kind: former | {name: [_sha256(work / name)] for name in there}})
+
+
+def publish(work: Path, out: Path, all_former: bool, say: Say = say, along: Iterable[Path] = ()) -> None:
+    """Move the files that a folder of new results has in its marker to their places in `out`.
+
+    What is in the way and was not written there by a command of the same kind is moved to `out/kept`.
+
+    Args:
+        work: the folder of new results.
+        out: where they belong.
+        all_former: remove former results of this kind that the new ones do not have.
+        say: gets a line that says what was moved to `kept`.
+        along: other folders of new results, which replace all former ones of their kinds at the same time.
+    """
+    move = {"all_former": all_former, "along": [other.name for other in along]}
+    write_json(work / MARKER, _read(work) | {"move": move})
+    complete(out, say)
+
+
+def complete(out: Path, say: Say = say) -> None:
+    """End moves that a kill stopped, and remove hidden folders of processes that are gone."""
+    if not _works(out):
+        return
+    with _marker_lock(out):
+        for work in _works(out):
+            move = _read(work).get("move")
+            if isinstance(move, dict):
+                for other in _works(out):
+                    if other.name in move.get("along", ()):
+                        _move(other, out, True, say)
+                _move(work, out, bool(move.get("all_former")), say)
+            elif work.name.startswith(_HIDDEN):
+                with held(work / _LOCK) as is_left:
+                    if is_left:
+                        shutil.rmtree(work, ignore_errors=True)
+            elif not (work / MARKER).exists():
+                with suppress(OSError):  # the user's, unless it is empty: a kill came before or after its marker
+                    work.rmdir()
+
+
+def unpublished(out: Path, kind: str) -> list[Path]:
+    """The folders of new results of a kind in `out` that outlived their process, in the order of their numbers."""
+    works = [work for work in _works(out) if not work.name.startswith(_HIDDEN)]
+    return sorted((work for work in works if kind in read_marker(work)), key=lambda work: (len(work.name), work.name))
+
+
+def discard(work: Path, names: Sequence[str] = ()) -> None:
+    """Remove what kgs wrote in a folder of new results, `names` included, and the folder if nothing else is in it."""
+    complete(work)
+    entered = [name for files in read_marker(work).values() for name in files]
+    own = [name for name in entered if is_own(work, name)]
+    temporary = [path.name for path in work.iterdir() if path.suffix in _TEMPORARY]
+    for name in (*own, *names, *temporary, _LOCK, _MARKER_LOCK):
+        (work / name).unlink(missing_ok=True)
+    for name in (*entered, *names):
+        _remove_empty((work / name).parent, work)
+    (work / MARKER).unlink(missing_ok=True)
+    with suppress(OSError):  # files of the user stay
+        work.rmdir()
+
+
+def clear(out: Path, names: Iterable[str], kind: str, say: Say = say) -> None:
+    """Move what is in the way of new results to `out/kept`: all that a command of the same kind did not write there."""
+    moved = list(_clear(out, names, read_marker(out).get(kind, {})))
+    if moved:
+        say(f"{printable(out)}: what was there and not as kgs wrote it is now {listed(moved, _MOST_NAMED)}")
+
+
+def is_own(folder: Path, name: str) -> bool:
+    """Whether a file in a folder of results is as kgs wrote it there."""
+    hashes = [sha for files in read_marker(folder).values() for sha in files.get(name, ())]
+    return os.path.lexists(folder / name) and _in_the_way(folder, name, hashes) is None
+
+
+def read_marker(folder: Path) -> dict[str, Hashes]:
+    """The SHA-256 of what kgs wrote in a folder, by kind and name; empty if there is no marker, or it is damaged."""
+    kinds = _read(folder).get("files")
+    return {
+        kind: {name: shas for name, shas in files.items() if isinstance(shas, list) and _is_below(name)}
+        for kind, files in (kinds.items() if isinstance(kinds, dict) else ())
+        if isinstance(files, dict)
+    }
+
+
+def _read(folder: Path) -> dict[str, Any]:
+    try:
+        return read_json(folder / MARKER)
+    except DataError:
+        return {}
+
+
+def _write_marker(folder: Path, entries: dict[str, Hashes]) -> None:
+    """Put entries in place of the former ones of their kinds."""
+    write_json(folder / MARKER, {"files": read_marker(folder) | entries})
+
+
+def _marker_lock(out: Path) -> AbstractContextManager[bool]:
+    """Wait until no other process changes the marker of a folder."""
+    return held(out / _MARKER_LOCK, wait=True)
+
+
+def _works(out: Path) -> list[Path]:
+    """The folders of new results in a folder."""
+    found = [path for prefix in (_UNFINISHED, _HIDDEN) for path in out.glob(f"{prefix}*")]
+    return [path for path in sorted(found) if path.is_dir() and not path.is_symlink()]
+
+
+def _move(work: Path, out: Path, all_former: bool, say: Say) -> None:
+    """Move the files of a folder of new results to their places; a kill at any moment, and the next call ends it."""
+    kind, new = next(iter(read_marker(work).items()), ("", {}))
+    former = read_marker(out).get(kind, {})
+    either = {name: [*former.get(name, ()), *new.get(name, ())] for name in {**former, **new}}
+    _write_marker(out, {kind: either})  # whichever of the two a kill leaves is known
+    waiting = [name for name in new if (work / name).is_file()]
+    clear(out, waiting, kind, say)
+    for name in waiting:
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        os.replace(work / name, out / name)
+    for name in former if all_former else ():
+        if name not in new and _in_the_way(out, name, former[name]) is None:
+            (out / name).unlink(missing_ok=True)
+            _remove_empty((out / name).parent, out)
+    _write_marker(out, {kind: new if all_former else former | new})
+    discard(work)
+
+
+def _clear(out: Path, names: Iterable[str], own: Hashes) -> Iterator[str]:
+    """Move what is in the way of files to `kept`, or `kept-2` and so on where names are taken; yields its new names."""
+    for name in names:
+        path = _in_the_way(out, name, own.get(name, ()))
+        if path is None:
+            continue
+        moved = path.relative_to(out).as_posix()
+        for number in count(1):
+            kept = out / (KEPT if number == 1 else f"{KEPT}-{number}")
+            if not os.path.lexists(kept / moved) and _in_the_way(out, f"{kept.name}/{moved}", ()) is None:
+                break
+        (kept / moved).parent.mkdir(parents=True, exist_ok=True)
+        os.rename(path, kept / moved)
+        yield f"{kept.name}/{moved}"
+
+
+def _in_the_way(folder: Path, name: str, own: Iterable[str]) -> Path | None:
+    """The user's file, folder or link in the place of a file, or in that of a folder above it; None: there is none."""
+    path = folder / name
+    above = [folder / part for part in reversed(PurePath(name).parents) if part.name]
+    if blocked := next((part for part in above if part.is_symlink() or (part.exists() and not part.is_dir())), None):
+        return blocked
+    if not os.path.lexists(path):
+        return None
+    is_own = path.is_file() and not path.is_symlink() and _sha256(path) in own
+    return None if is_own else path
+
+
+def _files(folder: Path) -> list[str]:
+    """The files of a folder of new results and its subfolders."""
+    files = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.suffix not in _TEMPORARY]
+    return [path.relative_to(folder).as_posix() for path in files if path.name not in (MARKER, _LOCK, _MARKER_LOCK)]
+
+
+def _sha256(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _is_below(name: str) -> bool:
+    """Whether a name in a marker is that of a file below its folder; a damaged marker may have others."""
+    path = PurePath(name)
+    return path.name != "" and not path.anchor and ".." not in path.parts
+
+
+def _remove_empty(folder: Path, root: Path) -> None:
+    """Remove a folder below `root`, and those above it, as far as they are empty."""
+    while folder != root and not folder.is_symlink():
+        if folder.is_dir():
+            if any(folder.iterdir()):
+                return
+            folder.rmdir()
+        folder = folder.parent
