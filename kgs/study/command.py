@@ -68,6 +68,8 @@ def study(
             be overwritten.
         ValueError: the preset has no such fits, `table` is not of this preset, or `steps` is out of its range.
     """
+    from kgs.app.files.publishing import replacing
+
     from . import beyond, beyond_report, paper_tables, presets
     from .cells import sparse_cell
     from .grid import finished_rows, read_rows, run_grid
@@ -83,7 +85,7 @@ def study(
         cells = presets.sparse_cells(preset, data)
         path = out / "sparse.jsonl"
         do_cell = sparse_cell
-        write = write_report
+        write = partial(write_report, source=path)
         if data is not None:
             for setting in presets.too_few_photos(preset, data):
                 print(f"left out: {setting}")
@@ -112,7 +114,8 @@ def study(
         if rows and not isinstance(sys.exception(), ValueError):  # another run may be writing its own
             folder = "" if preset == "quick" or data is None else "KGS_DATA=SCENES "
             options = same if lpips_weights is None else f"{same} --lpips-weights WEIGHTS"
-            write(rows, out, f"{folder}kgs study {options} -o OUT", len(cells))
+            with replacing(out, "study") as new:
+                write(rows, new, f"{folder}kgs study {options} -o OUT", len(cells))
     return int(len(finished_rows(chosen, path)) < len(chosen))
 
 
@@ -127,13 +130,17 @@ def _list(cells: list[dict[str, Any]], rows: list[dict[str, Any]]) -> None:
     print(f"{len(done)} of {len(cells)} are done")
 
 
-def check_study(preset: str, table: int | None, steps: int | None, lpips_weights: Path | None, **_: Any) -> None:
+def check_study(
+    out: Path, preset: str, table: int | None, steps: int | None, lpips_weights: Path | None, **_: Any
+) -> None:
     """Check the arguments of `kgs study`."""
     from kgs.app.cli.checks import check_installed
+    from kgs.app.files.outputs import check_folder
     from kgs.fit.config import FitConfig
     from kgs.metrics.weights import weight_files
 
     check_installed("cpu", "auto", "pandas", "scipy", "distributed", "matplotlib", "jinja2")
+    check_folder(out, make=False)
     if table is not None and preset != "paper":
         raise ValueError(f"table: expected the preset 'paper', which has the tables, got {preset!r}")
     FitConfig(steps=steps)

@@ -24,14 +24,17 @@ from .tables import sparse_tables
 TITLE = "Sparse views: DropGaussian on and off at equal initial points"
 
 
-def write_report(rows: Sequence[Mapping[str, Any]], out: Path, command: str, planned: int) -> str:
+def write_report(
+    rows: Sequence[Mapping[str, Any]], out: Path, command: str, planned: int, source: Path | None = None
+) -> str:
     """Write sparse.csv (a line per cell), sparse.md, index.html, and the plots that have something to show.
 
     Args:
         rows: dicts of "cell" and "result", any part of the study.
-        out: the folder, made if it is not there; the page names the commit of its sparse.jsonl, where git has one.
+        out: the folder, made if it is not there.
         command: what makes this report again.
         planned: how many cells the study has when it is done.
+        source: the file of the rows; the page names its commit, where git has one.
 
     Returns what sparse.md holds; ValueError as of `cells_frame`.
     """
@@ -43,7 +46,7 @@ def write_report(rows: Sequence[Mapping[str, Any]], out: Path, command: str, pla
     tables = sparse_tables(told)
     plots = write_plots(told, out)
     conclusions = findings(told)
-    origin = _origin(rows, frame, out, command, planned)
+    origin = _origin(rows, frame, source, command, planned)
     folders = ChoiceLoader([PackageLoader("kgs.study", ""), PackageLoader("kgs.app.page", "")])
     templates = Environment(loader=folders, autoescape=True, trim_blocks=True)
     templates.filters["parts"] = lambda text: re.split(r" (?=\[|or |\()", text)
@@ -74,12 +77,14 @@ def _write_csv(frame: pd.DataFrame, path: Path) -> None:
     lines.rename(columns=lambda name: name.replace(".", "_")).to_csv(path, index=False)
 
 
-def _origin(rows: Sequence[Mapping[str, Any]], frame: pd.DataFrame, out: Path, command: str, planned: int) -> list[str]:
+def _origin(
+    rows: Sequence[Mapping[str, Any]], frame: pd.DataFrame, source: Path | None, command: str, planned: int
+) -> list[str]:
     """Sentences: the command, how many cells of which days, and the commits and machines that made them."""
     figures = [f"{len(rows)} of {planned} cells"]
-    commit = revision(out / "sparse.jsonl")
-    if commit:
-        figures.append(f"sparse.jsonl at commit {commit}")
+    commit = revision(source) if source else None
+    if source and commit:
+        figures.append(f"{source.name} at commit {commit}")
     dates = frame.date.dropna()
     if len(dates):
         figures.append(f"from {dates.min()} to {dates.max()}")

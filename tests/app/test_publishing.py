@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from command import run
 
 from kgs.app.files.publishing import MARKER, begin, complete, discard, enter, is_own, publish, read_marker
 from kgs.app.files.publishing import replacing as replacing_files
@@ -336,3 +337,15 @@ def test_a_marker_that_names_more_than_files_below_its_folder_removes_nothing_el
     assert mine.exists()
     assert (out / "deeper").is_dir()
     assert contents(out) == {"a.txt": "new"}
+
+
+@pytest.mark.parametrize("name", ["speed", "precision", "extremes"])
+def test_benchmarks_follow_the_same_rules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setattr(f"kgs.bench.{name}.{name}", lambda out, **_: (out / f"{name}.md").write_text("new") and 0)
+    out = tmp_path / "new"
+    for _ in range(2):
+        assert run("bench", name, "-o", out) == 0
+    assert contents(out) == {f"{name}.md": "new"}
+    (out / f"{name}.md").write_text("mine")
+    assert run("bench", name, "-o", out) == 0
+    assert contents(out) == {f"{name}.md": "new", f"kept/{name}.md": "mine"}

@@ -1,5 +1,6 @@
 """`kgs bench`: what rendering costs on this machine, and how exact it is."""
 
+from pathlib import Path
 from typing import Any
 
 from .options import Out
@@ -19,9 +20,11 @@ def speed(*, out: Out, quick: bool = False, device: str = "cpu") -> None:
         quick: fewer Gaussians and repetitions.
         device: where to render: cpu, cuda, cuda:1, ...
     """
+    from kgs.app.files.publishing import replacing
     from kgs.bench.speed import speed
 
-    speed(out=out, quick=quick, device=device)
+    with replacing(out, "bench speed") as new:
+        speed(out=new, quick=quick, device=device)
 
 
 def precision(*, out: Out, quick: bool = False) -> None:
@@ -37,9 +40,11 @@ def precision(*, out: Out, quick: bool = False) -> None:
         out: folder for the results, created if it does not exist.
         quick: small images with few Gaussians.
     """
+    from kgs.app.files.publishing import replacing
     from kgs.bench.precision import precision
 
-    precision(out=out, quick=quick)
+    with replacing(out, "bench precision") as new:
+        precision(out=new, quick=quick)
 
 
 def extremes(*, out: Out) -> int:
@@ -54,13 +59,30 @@ def extremes(*, out: Out) -> int:
     Args:
         out: folder for the results, created if it does not exist.
     """
+    from kgs.app.files.publishing import replacing
     from kgs.bench.extremes import extremes
 
-    return extremes(out=out)
+    with replacing(out, "bench extremes") as new:
+        return extremes(out=new)
 
 
-def check_speed(device: str, **_: Any) -> None:
+def check_speed(out: Path, device: str, **_: Any) -> None:
     """Check the arguments of `kgs bench speed`."""
+    from kgs.app.files.outputs import check_folder
+
     from .checks import check_installed
 
     check_installed(device, "auto", "matplotlib")
+    check_folder(out, make=False)
+
+
+def check_precision(out: Path, **_: Any) -> None:
+    """Check the arguments of `kgs bench precision`."""
+    check_speed(out, "cpu")
+
+
+def check_extremes(out: Path, **_: Any) -> None:
+    """Check the arguments of `kgs bench extremes`."""
+    from kgs.app.files.outputs import check_folder
+
+    check_folder(out, make=False)

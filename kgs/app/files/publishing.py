@@ -47,8 +47,9 @@ def begin(out: Path, kind: str) -> Path:
 def replacing(out: Path, kind: str, all_former: bool = False, say: Say = say) -> Iterator[Path]:
     """A hidden folder for new files, which take their places in `out` when the block ends; see `publish`.
 
-    After an error in the block `out` is as it was.
+    `out` is created if it does not exist; after an error in the block it is as it was.
     """
+    out.mkdir(parents=True, exist_ok=True)
     complete(out, say)
     with ExitStack() as lock:
         with _marker_lock(out):
