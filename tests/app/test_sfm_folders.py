@@ -273,6 +273,19 @@ def test_a_users_own_files_stay(folder, tmp_path, found, name, kept):
     assert (tmp_path / "project" / (kept or name) if kept != "refused" else mine).read_bytes() == b"mine"
 
 
+@pytest.mark.parametrize("lost", [".kgs.json", ""])
+def test_a_copy_of_the_results_goes_on(folder, tmp_path, found, lost):
+    """Also without hidden files, as `cp OUT/* COPY` makes it."""
+    pose_photos(write_planes(folder), tmp_path / "out")
+    copy = tmp_path / "copy"
+    shutil.copytree(tmp_path / "out", copy, ignore=shutil.ignore_patterns(lost), copy_function=shutil.copyfile)
+    assert pose_photos(folder, copy)["reused"]
+    save(folder, planes()[:1, 20:], ["IMG_4.png"])
+    assert not pose_photos(folder, copy)["reused"]
+    assert len(list((copy / "images").iterdir())) == 4
+    assert (copy / "kept" / "photos.json").exists() == bool(lost)
+
+
 def test_new_cameras_wait_beside_the_fit_of_the_former_ones(folder, found):
     """Until the new fit is there `OUT` has a splat and the cameras that belong to it."""
     out = folder.parent / "out"

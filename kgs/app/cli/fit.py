@@ -87,12 +87,12 @@ def fit(
         live: show the splat as it grows on a page on this machine, until the fit ends; a line says its address.
         config: every number of the fit.
     """
-    from kgs.app.files.publishing import read_marker
     from kgs.app.fit_folder import fit_folder
     from kgs.app.scene_request import SceneRequest
     from kgs.app.stages import Stages
     from kgs.datasets import load_scene
     from kgs.datasets.field import field_size
+    from kgs.datasets.folders import CAMERAS_REPORT
     from kgs.fit.prune import left_out
     from kgs.machine import check_packages
     from kgs.metrics.evaluate import as_text
@@ -130,7 +130,7 @@ def fit(
         stages.begin("cameras")
         assert not isinstance(size, str)  # refused before
         request, base = find_scene(scene, out, request, config.seed, size, frames)
-    elif read_marker(out).get("photos"):
+    elif (out / CAMERAS_REPORT).exists():
         raise DataError(out, "", "holds cameras that kgs found for other photos: choose another folder")
     elif size == "field":
         photo_folder, factor, why = field_size(scene)

@@ -9,11 +9,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kgs.datasets.folders import LAYOUT_FILES, list_images
+from kgs.datasets.folders import CAMERAS_REPORT, LAYOUT_FILES, list_images
 from kgs.errors import DataError
 from kgs.json_files import write_whole
 
-from .publishing import is_own, read_marker
+from .publishing import is_own
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -39,7 +39,7 @@ def check_folder(out: Path, scene: Path | None = None, make: bool = True) -> Non
         raise DataError(out, "", f"results cannot be written there: no permission for {there}")
     inside = scene is not None and out.resolve().is_relative_to(scene.resolve())
     has_photos = inside and there == out and not all(is_own(out, path.name) for path in list_images(out))
-    of_photos = ("sparse",) if read_marker(out).get("photos") else ()  # cameras that a former run found
+    of_photos = ("sparse",) if (out / CAMERAS_REPORT).exists() else ()  # kgs wrote it: cameras that a former run found
     if has_photos or any((out / name).exists() for name in _SCENES if name not in of_photos):
         raise DataError(out, "", "holds files of a scene: choose another folder")
     if make:

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 from kgs.app.files.outputs import check_folder
-from kgs.app.files.publishing import read_marker
 from kgs.datasets.folders import CAMERAS_REPORT, list_images
 from kgs.errors import DataError
 from kgs.json_files import read_json
@@ -21,8 +20,8 @@ def check_place(out: Path, folder: Path) -> None:
     results = [out / IMAGES, out / MASKS, out / "sparse"]
     if photos == out.resolve() or any(photos.is_relative_to(path.resolve()) for path in results):
         raise DataError(out, "", "holds the photos themselves: choose another folder")
-    is_own = bool(read_marker(out).get("photos"))
-    if not is_own and any(path.is_dir() and list_images(path) for path in results):
+    is_of_kgs = (out / REPORT).exists()
+    if not is_of_kgs and any(path.is_dir() and list_images(path) for path in results):
         raise DataError(out, "", "holds photos that kgs did not write: choose another folder")
     check_folder(out, folder, make=False)
 
