@@ -100,11 +100,16 @@ def save_compressed_ply(path: str | os.PathLike[str], model: GaussianModel, offs
 
 
 def _check_finite(values: dict[str, NDArray[np.float64]]) -> None:
-    """A ValueError where a parameter is not finite in float32; but the logarithm of a flat disc's scale is -inf."""
+    """A ValueError where a parameter is not finite in float32.
+
+    But the logarithm of a flat disc's scale is -inf, and the logits of the opacities 1 and 0 are inf and -inf.
+    """
     for name, array in values.items():
         invalid = ~(np.abs(array) <= np.finfo(np.float32).max)
         if name == "log_scales":
             invalid &= array != -np.inf
+        if name == "opacity_logits":
+            invalid = np.isnan(array)
         if invalid.any():
             raise ValueError(f"model: expected values that are finite in float32, got {array[invalid][0]} in {name}")
 

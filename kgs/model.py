@@ -34,7 +34,7 @@ class GaussianModel(nn.Module):
         means: centres in world units, `(N, 3)`, float32 or float64.
         quats: rotations as quaternions w, x, y, z of any norm of at least 1e-38, `(N, 4)`.
         log_scales: natural logarithm of the standard deviations in world units, `(N, 3)`; -inf for a flat disc.
-        opacity_logits: the opacities before the sigmoid, `(N,)`.
+        opacity_logits: the opacities before the sigmoid, `(N,)`; inf for 1, -inf for 0.
         sh_dc: harmonics of degree 0, `(N, 1, 3)`.
         sh_rest: harmonics of degree 1 and above, `(N, K - 1, 3)` with K = 1, 4, 9 or 16.
         sh_degree: the active degree, 0 to that of `sh_rest`; None takes that of `_extra_state`, else that of `sh_rest`.

@@ -33,6 +33,10 @@ SCALARS = {
 _REST_COUNTS = [3 * (size - 1) for size in SH_SIZES]  # properties f_rest, by degree
 
 
+class Float32Warning(UserWarning):
+    """Float32 cannot hold the positions of a splat, as it can relative to an origin near them."""
+
+
 def save_ply(
     path: str | os.PathLike[str], model: GaussianModel, offset: Tensor | None = None, sh_degree: int | None = None
 ) -> None:
@@ -101,8 +105,9 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
 
     Other properties and elements are skipped. The active degree is that of a comment of kgs, else that of the harmonics
     in the file. The model is antialiased if a comment says so: `SplatRenderMode: mip` (Brush, splat-transform, kgs) or
-    `antialiased 1` (Postshot). Scales of -inf, those of flat discs, are read as they are. Warns where float32 cannot
-    hold the positions and an `origin` would help.
+    `antialiased 1` (Postshot). Scales of -inf, those of flat discs, and opacities of inf and -inf, which are 1 and 0,
+    are read as they are. Rows that are no Gaussian are left out with a warning that counts them: rotations of length 0,
+    and other values that are not finite. Warns, with a Float32Warning, where an `origin` would help.
 
     Args:
         path: the file to read.
@@ -113,7 +118,7 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
 
     Raises:
         DataError: the file cannot be read, its header is wrong, a property is missing, the number of bytes is not what
-            the header says, or a value is not finite.
+            the header says, or half of the rows or more have a value that is not finite.
         ValueError: `origin` has another shape or is not finite.
     """
     path = Path(path)
@@ -136,15 +141,17 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
     with np.errstate(over="ignore"):
         others = (columns[name].astype(np.float32) for name in names[3:])
         table = np.stack([*means.astype(np.float32).T, *others], axis=1)
-    invalid = np.argwhere(_invalid(table, names))
-    if len(invalid):
-        row, column = invalid[0]
-        raise DataError(path, names[column], f"expected finite float32 values, got {table[row, column]} in row {row}")
+    kept = _rows_of_gaussians(path, table, names)
+    if not kept.all():
+        warnings.warn(f"{path}: {_count_left_out(table, kept)}", stacklevel=2)
+        table = table[kept]
+        means = means[kept]
     parts = torch.from_numpy(table).split([3, 3, rest, 1, 3, 4], dim=1)
     means32, sh_dc, sh_rest, opacity_logits, log_scales, quats = parts
     if float32_moves(means, log_scales.numpy()):
         centre = ", ".join(f"{value:.0f}" for value in np.median(means, axis=0))
-        warnings.warn(f"{path}: float32 moves its Gaussians; pass an origin= near them, ({centre})", stacklevel=2)
+        message = f"{path}: float32 moves its Gaussians; pass an origin= near them, ({centre})"
+        warnings.warn(message, Float32Warning, stacklevel=2)
     return GaussianModel(
         means32,
         quats,
@@ -168,14 +175,39 @@ def as_vector(name: str, value: Tensor) -> NDArray[np.float64]:
 
 
 def _invalid(table: NDArray[np.float32], names: list[str]) -> NDArray[np.bool_]:
-    """The entries that no splat can have: NaN and infinity, but for the scale of a flat disc, whose logarithm is -inf.
+    """The entries that no splat can have: NaN and infinity.
 
-    `names` are the properties in the columns of the table.
+    But the scale of a flat disc has the logarithm -inf, and opacities of 1 and 0 have the logits inf and -inf. `names`
+    are the properties in the columns of the table.
     """
     invalid = ~np.isfinite(table)
     scales = [i for i, name in enumerate(names) if name.startswith("scale_")]
+    opacity = names.index("opacity")
     invalid[:, scales] &= table[:, scales] != -np.inf
+    invalid[:, opacity] = np.isnan(table[:, opacity])
     return invalid
+
+
+def _rows_of_gaussians(path: Path, table: NDArray[np.float32], names: list[str]) -> NDArray[np.bool_]:
+    """Which rows are Gaussians: all values are those of a splat, and the rotation, the last four, has a length, `(N,)`.
+
+    A DataError if the values of half of the rows or more are not: then the file is damaged, or of another kind.
+    """
+    invalid = _invalid(table, names)
+    valid_rows: NDArray[np.bool_] = ~invalid.any(axis=1)
+    if 2 * int(valid_rows.sum()) <= len(table) and len(table):
+        row, column = np.argwhere(invalid)[0]
+        raise DataError(path, names[column], f"expected finite float32 values, got {table[row, column]} in row {row}")
+    return valid_rows & table[:, -4:].any(axis=1)
+
+
+def _count_left_out(table: NDArray[np.float32], kept: NDArray[np.bool_]) -> str:
+    """How many rows are left out, and why."""
+    without_length = int((~table[:, -4:].any(axis=1)).sum())
+    not_finite = int((~kept).sum()) - without_length
+    counts = ((without_length, "have a rotation of length 0"), (not_finite, "have values that are not finite"))
+    reasons = " and ".join(f"{count} {what}" for count, what in counts if count)
+    return f"{int((~kept).sum())} of {len(table)} Gaussians are left out: {reasons}"
 
 
 def _degree_of_file(sh_degree: int | None, model: GaussianModel) -> int:

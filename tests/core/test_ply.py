@@ -15,6 +15,7 @@ from hypothesis.extra import numpy as arrays
 from kgs import Densifier, GaussianRenderer
 from kgs.app.files.glb import save_glb
 from kgs.app.page.data import pack
+from kgs.compressed_ply import save_compressed_ply
 from kgs.datasets import Views
 from kgs.fit.prune import contributions
 from kgs.model import GaussianModel
@@ -52,6 +53,7 @@ def test_what_is_written_comes_back_bit_for_bit(tmp_path, degree, n):
 def test_any_finite_float32_comes_back_bit_for_bit(tmp_path_factory, values):
     path = tmp_path_factory.getbasetemp() / "any.ply"
     table = torch.from_numpy(values)
+    table[:, 3] = table[:, 3].masked_fill((table[:, 3:7] == 0).all(dim=1), 1.0)  # rotations of length 0 are left out
     model = GaussianModel(
         means=table[:, :3],
         quats=table[:, 3:7],
@@ -227,15 +229,46 @@ def test_a_flat_disc_has_the_footprint_of_an_ellipse(tmp_path, each_backend, deg
     assert all(bool(parameter.grad.isfinite().all()) for parameter in model.parameters() if parameter.grad is not None)
 
 
-def test_what_takes_a_splat_takes_flat_discs(tmp_path):
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_opacities_of_exactly_one_and_zero(tmp_path, each_backend, antialiased):
+    """As other programs write them, whose logits are infinite; large logits have the same opacities in float32."""
+    infinite = random_model(4, 0)
+    with torch.no_grad():
+        infinite.means.copy_(torch.tensor([[0.0, 0.0, 2.0], [0.3, 0.0, 1.5], [0.0, 0.2, 3.0], [0.1, 0.1, 1.0]]))
+        infinite.opacity_logits.copy_(torch.tensor([math.inf, 0.5, math.inf, -math.inf]))
+    save_ply(tmp_path / "a.ply", infinite)
+    model = load_ply(tmp_path / "a.ply")
+    assert same(model, infinite)
+    assert model().opacities.tolist() == [1.0, torch.tensor(0.5).sigmoid().item(), 1.0, 0.0]
+    finite = load_ply(tmp_path / "a.ply")
+    with torch.no_grad():
+        finite.opacity_logits.clamp_(-200.0, 200.0)
+    gradients = []
+    images = []
+    for each in (model, finite):
+        image = GaussianRenderer(antialiased=antialiased)(each(), pinhole(40, 48, 50.0, dtype=torch.float32)).image
+        (image**2).sum().backward()
+        images.append(image.detach())
+        gradients.append([parameter.grad for parameter in each.parameters() if parameter.grad is not None])
+    assert torch.equal(*images)
+    assert float(images[0].max()) > 0.5
+    for one, two in zip(*gradients, strict=True):
+        assert one.isfinite().all()
+        assert torch.equal(one, two)
+
+
+def test_what_takes_a_splat_takes_flat_discs_and_opacities_of_one_and_zero(tmp_path):
     model = small_model()
     with torch.no_grad():
         model.log_scales[::2] = DISC
         model.log_scales[1] = -math.inf
+        model.opacity_logits[[0, 2]] = math.inf
+        model.opacity_logits[5] = -math.inf
     camera = pinhole(40, 48, 50.0, dtype=torch.float32)
     views = Views(camera, torch.rand(1, 3, 40, 48), ("0.png",))
     save_glb(tmp_path / "a.glb", model, torch.eye(3))
-    assert pack(model(), camera, most_bytes=10**6).layout["count"] == len(model)
+    save_compressed_ply(tmp_path / "a.compressed.ply", model)
+    assert pack(model(), camera, most_bytes=10**6).layout["count"] == len(model) - 1  # one is invisible
     weights = contributions(model, views, RasterOptions(near_plane=0.01))
     assert weights.isfinite().all()
     assert weights[2] > 0
@@ -244,6 +277,7 @@ def test_what_takes_a_splat_takes_flat_discs(tmp_path):
     render.projected.means2d.retain_grad()
     render.image.sum().backward()
     densifier.observe(render.projected)
+    densifier.decay_opacity(0.99)
     report = densifier.step()
     assert report.cloned > 0
     assert report.split > 0

@@ -2,6 +2,7 @@
 
 import math
 import random
+import re
 import struct
 import tracemalloc
 
@@ -159,9 +160,9 @@ GOOD = handmade(FLOATS, [ROW])
         (handmade(FLOATS, [ROW], after=[(["element e 1", "property int i"], b"\0")]), "vertex", "expected 72 bytes"),
         (handmade(FLOATS, [ROW, ROW], "ascii")[:-5], "vertex", "expected 34 numbers after the header, got 33"),
         (handmade(FLOATS, [ROW], "ascii").replace(b" 2.0", b" two"), "vertex", "nothing but numbers"),
-        (handmade(FLOATS, [[*ROW[:9], math.inf, *ROW[10:]]]), "opacity", "got inf in row 0"),
+        (handmade(FLOATS, [[*ROW[:9], math.nan, *ROW[10:]]]), "opacity", "got nan in row 0"),
         (handmade(FLOATS, [ROW, [*ROW[:16], math.nan]]), "rot_3", "got nan in row 1"),
-        (handmade(FLOATS, [[*ROW[:9], -math.inf, *ROW[10:]]]), "opacity", "got -inf in row 0"),
+        (handmade(FLOATS, [[-math.inf, *ROW[1:]]]), "x", "got -inf in row 0"),
         (handmade(FLOATS, [[*ROW[:11], math.inf, *ROW[12:]]]), "scale_1", "got inf in row 0"),
         (handmade(FLOATS, [[*ROW[:11], math.nan, *ROW[12:]]]), "scale_1", "got nan in row 0"),
         (handmade([("x", "double"), *FLOATS[1:]], [[1e300, *ROW[1:]]]), "x", "finite float32"),
@@ -177,6 +178,48 @@ def test_bad_files_are_described(tmp_path, data, field, reason):
         load_ply(path)
     assert (caught.value.path, caught.value.field) == (path, field)
     assert reason in caught.value.reason
+
+
+def changed(**values):
+    """`ROW` with other values of some properties."""
+    return [values.get(name, value) for (name, _), value in zip(FLOATS, ROW, strict=True)]
+
+
+@pytest.mark.parametrize("order", ["binary_little_endian", "ascii"])
+def test_opacities_of_one_and_zero_have_infinite_logits(tmp_path, order):
+    rows = [changed(opacity=math.inf), changed(opacity=-math.inf), changed(opacity=1e300 if order == "ascii" else 90.0)]
+    (tmp_path / "a.ply").write_bytes(handmade(FLOATS, rows, order))
+    assert load_ply(tmp_path / "a.ply")().opacities.tolist() == [1.0, 0.0, 1.0]
+
+
+NO_ROTATION = {f"rot_{i}": 0.0 for i in range(4)}
+NO_GAUSSIANS = [
+    ([[0.0] * 17], "1 of 5 Gaussians are left out: 1 have a rotation of length 0"),
+    ([changed(**NO_ROTATION | {"rot_2": -0.0})] * 9, "9 of 13 Gaussians are left out: 9 have a rotation of length 0"),
+    ([changed(y=math.nan)], "1 of 5 Gaussians are left out: 1 have values that are not finite"),
+    ([changed(z=-math.inf), changed(scale_1=math.inf)], "2 of 6 Gaussians are left out: 2 have values that are not"),
+    ([changed(f_dc_0=math.nan), [math.nan] * 17], "2 of 6 Gaussians are left out: 2 have values that are not finite"),
+    ([changed(rot_0=math.inf), [0.0] * 17], "length 0 and 1 have values that are not finite"),
+    ([changed(**NO_ROTATION, x=math.nan)], "1 of 5 Gaussians are left out: 1 have a rotation of length 0"),
+]
+
+
+@pytest.mark.parametrize(("rows", "message"), NO_GAUSSIANS)
+@pytest.mark.parametrize("order", ["binary_little_endian", "ascii"])
+def test_rows_that_are_no_gaussians_are_left_out_and_counted(tmp_path, rows, message, order):
+    good = [changed(x=float(i)) for i in range(4)]
+    path = tmp_path / "a.ply"
+    path.write_bytes(handmade(FLOATS, [good[0], *rows, *good[1:]], order))
+    with pytest.warns(UserWarning, match=f"a.ply: .*{re.escape(message)}"):
+        model = load_ply(path)
+    assert model.means[:, 0].tolist() == [0.0, 1.0, 2.0, 3.0]
+    assert all(bool(parameter.isfinite().all()) for parameter in model.parameters())
+
+
+def test_a_file_of_nothing_but_zeros_is_an_empty_model(tmp_path):
+    (tmp_path / "a.ply").write_bytes(handmade(FLOATS, [[0.0] * 17] * 3))
+    with pytest.warns(UserWarning, match="3 of 3 Gaussians are left out"):
+        assert len(load_ply(tmp_path / "a.ply")) == 0
 
 
 @pytest.mark.parametrize("order", ["binary_little_endian", "ascii"])

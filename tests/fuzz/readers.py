@@ -85,8 +85,9 @@ def _read_image(folder: Path, suffix: str) -> None:
 
 def _read_ply(folder: Path) -> None:
     for name, value in load_ply(folder / "splat.ply").state_dict().items():
-        least = -math.inf if name == "log_scales" else -3.5e38  # of a flat disc
-        check_range(name, value, least, 3.5e38)
+        least = -math.inf if name in ("log_scales", "opacity_logits") else -3.5e38  # of a flat disc, of an opacity of 0
+        most = math.inf if name == "opacity_logits" else 3.5e38
+        check_range(name, value, least, most)
 
 
 def check_scene(scene: Scene) -> None:

@@ -111,16 +111,16 @@ def _load_alone(ply: Path) -> tuple["GaussianModel", "Tensor"]:
     """A splat without cameras, and the offset of its frame: 0, unless float32 would move its Gaussians."""
     import torch
 
-    from kgs.ply import load_ply
+    from kgs.ply import Float32Warning, load_ply
 
-    offset = torch.zeros(3, dtype=torch.float64)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        model = load_ply(ply)
-    if caught:
-        offset = model.means.detach().double().median(dim=0).values
-        model = load_ply(ply, origin=offset)
-    return model, offset
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", Float32Warning)
+        try:
+            return load_ply(ply), torch.zeros(3, dtype=torch.float64)
+        except Float32Warning:
+            warnings.simplefilter("ignore")  # the other warnings were shown
+            offset = load_ply(ply).means.detach().double().median(dim=0).values
+            return load_ply(ply, origin=offset), offset
 
 
 def _say_levels(fit: "Fit", cleaned: "Cleaned") -> None:
