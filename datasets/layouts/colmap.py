@@ -5,9 +5,7 @@ Source: https://colmap.github.io/cameras.html.
 
 from pathlib import Path
 
-import kornia.geometry as kg
 import torch
-from torch import Tensor
 
 from kgs.datasets.folders import find_models, image_folder
 from kgs.datasets.frames import Frame, FrameSet, PointCloud, find_file
@@ -15,7 +13,8 @@ from kgs.datasets.image_file import ImageFile
 from kgs.datasets.images import Intrinsics
 from kgs.errors import DataError, listed
 
-from .colmap_model import ColmapCamera, ColmapImage, model_file, read_cameras, read_images, read_points
+from .colmap_model import ColmapCamera, model_file, read_cameras, read_images, read_points
+from .colmap_poses import registered_images
 
 _LISTED = 20
 
@@ -26,16 +25,18 @@ def load_colmap(root: Path, photo_folder: str = "") -> FrameSet:
     Photos that are gone are left out with a note, unless more than half of them are.
 
     Convention:
-        COLMAP's poses are world-to-camera with OpenCV axes already; its first pixel's centre is at (0.5, 0.5).
+        COLMAP's first pixel has its centre at (0.5, 0.5).
     """
     folder, notes = largest_model(root)
     cameras_file = model_file(folder, "cameras")
     images_file = model_file(folder, "images")
     cameras = read_cameras(cameras_file)
+    registered = registered_images(folder)
+    notes += registered.notes
     photos = image_folder(root, photo_folder)
     frames = []
     ids = {}
-    for image_id, image in read_images(images_file).items():
+    for (image_id, image), pose in zip(registered.images.items(), registered.poses, strict=True):
         if image.camera_id not in cameras:
             raise DataError(images_file, image.name, f"has camera {image.camera_id}, which {cameras_file.name} lacks")
         path = find_file(images_file, root, image.name, photos)
@@ -43,7 +44,7 @@ def load_colmap(root: Path, photo_folder: str = "") -> FrameSet:
             beside = find_file(images_file, root, image.name)
             path = beside if beside.is_file() else path
         lens = _intrinsics(cameras[image.camera_id])
-        frames.append(Frame(images_file, image.name, ImageFile(path), lens, camera_to_world(image)))
+        frames.append(Frame(images_file, image.name, ImageFile(path), lens, pose))
         ids[path] = image_id
     gone = [frame.name for frame in frames if not frame.path.is_file()]
     if 0 < len(gone) <= len(frames) / 2:
@@ -73,14 +74,6 @@ def _image_count(folder: Path) -> int:
         return 0
 
 
-def camera_to_world(image: ColmapImage) -> Tensor:
-    """The pose of a registered photo, `(4, 4)` float64 camera-to-world with OpenCV axes."""
-    quat = torch.tensor(image.quat, dtype=torch.float64)
-    rotation = kg.quaternion_to_rotation_matrix(quat)[None] * (1.0 if float(quat.norm()) > 0 else torch.nan)
-    translation = torch.tensor(image.translation, dtype=torch.float64)[None, :, None]
-    return kg.Rt_to_matrix4x4(*kg.worldtocam_to_camtoworld_Rt(rotation, translation))[0]
-
-
 def track_points(folder: Path, image_ids: set[int]) -> PointCloud:
     """The points that at least two of the given images observe; their positions were refined with all images."""
     points, colors = read_points(model_file(folder, "points3D"), image_ids)
@@ -93,7 +86,8 @@ def _intrinsics(camera: ColmapCamera) -> Intrinsics:
     if model.startswith(("SIMPLE_", "RADIAL")):
         numbers = (numbers[0], *numbers)
     fx, fy, cx, cy, *distortion = numbers
-    # Radial models end with k1 or k1, k2; what OpenCV's order has next (p1, p2; k3, k4 of a fisheye) is 0 then.
-    if "RADIAL" in model:
-        distortion = [*distortion, 0.0, 0.0, 0.0][:4]
-    return Intrinsics(camera.width, camera.height, fx, fy, cx, cy, tuple(distortion), model.endswith("FISHEYE"))
+    is_fisheye = model.endswith("FISHEYE")
+    # Radial models end with k1 or k1, k2, other fisheyes may have none; what OpenCV's order has next is 0 then.
+    if "RADIAL" in model or is_fisheye:
+        distortion = [*distortion, 0.0, 0.0, 0.0, 0.0][:4]
+    return Intrinsics(camera.width, camera.height, fx, fy, cx, cy, tuple(distortion), is_fisheye)

@@ -1,12 +1,14 @@
 """COLMAP's sparse models, binary and text, as plain numbers.
 
-Source: https://colmap.github.io/format.html. The rigs and frames of newer versions repeat what images.* says and are
-not read. Every count is checked against the file's length before memory is allocated for it.
+Source: https://colmap.github.io/format.html, and https://colmap.github.io/rigs.html for rigs and frames. Every count is
+checked against the file's length before memory is allocated for it.
 """
 
+import re
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -17,10 +19,17 @@ from kgs.datasets.image_file import read_bytes
 from kgs.errors import DataError
 
 T = TypeVar("T")
+STEMS = ("cameras", "images", "points3D")  # the files of a model that COLMAP needs
 _LONGEST_NAME = 4096
 # In the order of COLMAP's model ids: how many parameters each has, 0 for those that are not read.
 _MODELS = dict(SIMPLE_PINHOLE=3, PINHOLE=4, SIMPLE_RADIAL=4, RADIAL=5, OPENCV=8, OPENCV_FISHEYE=8, FULL_OPENCV=12)
 _MODELS |= dict(FOV=0, SIMPLE_RADIAL_FISHEYE=4, RADIAL_FISHEYE=5, THIN_PRISM_FISHEYE=0, RAD_TAN_THIN_PRISM_FISHEYE=0)
+_MODELS |= dict(SIMPLE_DIVISION=0, DIVISION=0, SIMPLE_FISHEYE=3, FISHEYE=4, EUCM=0, EQUIRECTANGULAR=0)
+_SENSORS = {"CAMERA": 0, "IMU": 1}  # COLMAP's numbers of the kinds
+_CAMERA = _SENSORS["CAMERA"]
+# What words of a text stand for, by the code that their numbers have in a binary file.
+_WORDS: dict[str, Callable[[str], Any]] = {"i": _SENSORS.__getitem__, "I": int, "Q": int, "B": int, "d": float}
+_SUFFIXES = ("bin", "txt")
 
 
 class ColmapCamera(NamedTuple):
@@ -32,18 +41,40 @@ class ColmapCamera(NamedTuple):
     params: tuple[float, ...]
 
 
-class ColmapImage(NamedTuple):
-    """A registered photo: world-to-camera rotation as a quaternion (w, x, y, z), translation, camera id, name."""
+class ColmapPose(NamedTuple):
+    """A transformation from the world, or from a rig: rotation as a quaternion (w, x, y, z), and translation."""
 
     quat: tuple[float, ...]
     translation: tuple[float, ...]
+
+
+_IDENTITY = ColmapPose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+
+class ColmapImage(NamedTuple):
+    """A registered photo: its pose from world to camera, camera id, name."""
+
+    pose: ColmapPose
     camera_id: int
     name: str
 
 
+class ColmapFrame(NamedTuple):
+    """What a rig saw at once: the rig's pose from the world; the photos' ids, and the camera of each."""
+
+    rig_id: int
+    pose: ColmapPose
+    cameras: dict[int, int]
+
+
 def model_file(folder: Path, stem: str) -> Path:
-    """The binary file of that stem, else the text file, else a DataError."""
-    for suffix in ("bin", "txt"):
+    """A file of a model: the one with that stem, of the format that COLMAP reads; a DataError if there is none.
+
+    COLMAP reads binary files if all three are there, else text files if all three are. Where neither are, the binary
+    file comes before the text file.
+    """
+    whole = [suffix for suffix in _SUFFIXES if all((folder / f"{stem}.{suffix}").is_file() for stem in STEMS)]
+    for suffix in [*whole, *_SUFFIXES]:
         if (folder / f"{stem}.{suffix}").is_file():
             return folder / f"{stem}.{suffix}"
     raise DataError(folder, "", f"expected {stem}.bin or {stem}.txt, found neither")
@@ -78,7 +109,7 @@ def read_images(path: Path) -> dict[int, ColmapImage]:
             image_id, *pose, camera_id = data.take("<I7dI", "image")
             name = data.string(f"image {image_id}")
             data.take(f"{24 * data.count(f'observations of {name}', 24)}x", "observations")  # skipped
-            _add(path, "image", images, image_id, ColmapImage(tuple(pose[:4]), tuple(pose[4:]), camera_id, name))
+            _add(path, "image", images, image_id, ColmapImage(_pose(pose), camera_id, name))
     else:
         may_be_observations = False
         for line in _lines(path):
@@ -86,9 +117,44 @@ def read_images(path: Path) -> dict[int, ColmapImage]:
                 may_be_observations = False  # an image's second line may be empty, or left out
                 continue
             image_id, *pose, camera_id, name = _fields(path, line, (int, *[float] * 7, int, str))
-            _add(path, "image", images, image_id, ColmapImage(tuple(pose[:4]), tuple(pose[4:]), camera_id, name))
+            _add(path, "image", images, image_id, ColmapImage(_pose(pose), camera_id, name))
             may_be_observations = True
     return images
+
+
+def read_rigs(path: Path) -> dict[int, dict[int, ColmapPose | None]]:
+    """Read rigs.bin or rigs.txt: of each rig its cameras' poses from the rig; None: a pose that is not known.
+
+    Damage or a repeated id is a DataError. Sensors that are no cameras are skipped.
+    """
+    rigs: dict[int, dict[int, ColmapPose | None]] = {}
+    for record in _records(path, "number of rigs", 8):
+        rig_id, count = record.take("<II", "rig")
+        cameras: dict[int, ColmapPose | None] = {}
+        for i in range(count):
+            kind, sensor_id = record.take("<iI", f"rig {rig_id}")
+            pose: ColmapPose | None = _IDENTITY  # the first sensor is where the rig is
+            if i > 0:
+                (is_known,) = record.take("<B", f"rig {rig_id}")
+                pose = _pose(record.take("<7d", f"rig {rig_id}")) if is_known else None
+            if kind == _CAMERA:
+                _add(path, f"rig {rig_id}: camera", cameras, sensor_id, pose)
+        _add(path, "rig", rigs, rig_id, cameras)
+    return rigs
+
+
+def read_frames(path: Path) -> dict[int, ColmapFrame]:
+    """Read frames.bin or frames.txt without what no camera saw; damage or a repeated id is a DataError."""
+    frames: dict[int, ColmapFrame] = {}
+    for record in _records(path, "number of frames", 68):
+        frame_id, rig_id, *pose, count = record.take("<II7dI", "frame")
+        cameras: dict[int, int] = {}
+        for _ in range(count):
+            kind, sensor_id, data_id = record.take("<iIQ", f"frame {frame_id}")
+            if kind == _CAMERA:
+                _add(path, f"frame {frame_id}: image", cameras, data_id, sensor_id)
+        _add(path, "frame", frames, frame_id, ColmapFrame(rig_id, _pose(pose), cameras))
+    return frames
 
 
 def read_points(path: Path, image_ids: set[int]) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
@@ -170,6 +236,48 @@ class _Binary:
             raise DataError(self._path, what, f"needs {size} bytes at byte {self._at}, the file has {left} more")
 
 
+class _Line:
+    """A line of a text model, whose words are read in order as `_Binary` reads numbers."""
+
+    def __init__(self, path: Path, line: str) -> None:
+        self._path = path
+        self._line = line
+        self._words = iter(line.split())
+
+    def take(self, form: str, what: str) -> tuple[Any, ...]:
+        codes = "".join(code * int(count or 1) for count, code in re.findall(r"(\d*)([a-zA-Z])", form))
+        words = list(islice(self._words, len(codes)))
+        try:
+            return tuple(_WORDS[code](word) for code, word in zip(codes, words, strict=True))
+        except (KeyError, ValueError) as error:
+            raise DataError(
+                self._path, what, f"expected a line as COLMAP writes it, got {self._line[:60]!r}"
+            ) from error
+
+    def end(self) -> None:
+        """The line has to end here."""
+        if left := list(self._words):
+            raise DataError(self._path, f"line {self._line[:60]!r}", f"{len(left)} words are left over")
+
+
+def _records(path: Path, what: str, least_bytes: int) -> Iterator[_Binary | _Line]:
+    """Of each of a file's records what reads it: the file's bytes, or a line."""
+    if path.suffix == ".bin":
+        data = _Binary(path)
+        for _ in data.items(what, least_bytes):
+            yield data
+    else:
+        for text in filter(None, _lines(path)):
+            line = _Line(path, text)
+            yield line
+            line.end()
+
+
+def _pose(numbers: Sequence[float]) -> ColmapPose:
+    """A pose of seven numbers: a quaternion and a translation."""
+    return ColmapPose(tuple(numbers[:4]), tuple(numbers[4:]))
+
+
 def _lines(path: Path) -> Iterator[str]:
     """The lines of a text model without its comments, stripped; empty ones included."""
     try:
@@ -205,7 +313,8 @@ def _parameter_count(path: Path, camera_id: int, model: str) -> int:
     if count := _MODELS.get(model):
         return count
     known = ", ".join(name for name, count in _MODELS.items() if count)
-    raise DataError(path, f"camera {camera_id}", f"camera model {model} cannot be read, only {known}")
+    reason = f"camera model {model} cannot be read, only {known}: undistort the photos with colmap image_undistorter"
+    raise DataError(path, f"camera {camera_id}", reason)
 
 
 def _add(path: Path, what: str, table: dict[int, T], key: int, value: T) -> None:

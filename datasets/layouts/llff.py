@@ -14,8 +14,8 @@ from kgs.datasets.image_file import ImageFile
 from kgs.datasets.images import Intrinsics
 from kgs.errors import DataError
 
-from .colmap import camera_to_world, largest_model, track_points
-from .colmap_model import model_file, read_images
+from .colmap import largest_model, track_points
+from .colmap_poses import registered_images
 
 
 def load_llff(root: Path, photo_folder: str = "") -> FrameSet:
@@ -68,13 +68,15 @@ def _frame(source: Path, path: Path, row: NDArray[np.float64]) -> Frame:
 
 def _model_points(folder: Path, frames: Sequence[Frame], train: Sequence[Frame]) -> PointCloud:
     """The points of the COLMAP model that the poses were made from; its images and the photos pair in order of name."""
-    images = sorted(read_images(model_file(folder, "images")).items(), key=lambda item: item[1].name)
-    if len(images) == len(frames):
+    registered = registered_images(folder)
+    images = list(registered.images.items())
+    order = sorted(range(len(images)), key=lambda row: images[row][1].name)
+    if len(order) == len(frames):
         given = torch.stack([frame.pose for frame in frames])
-        model = torch.stack([camera_to_world(image) for _, image in images])
+        model = torch.stack([registered.poses, registered.own_poses])[:, order]  # LLFF's program reads the latter
         span = (given[:, :3, 3] - given[:, :3, 3].mean(dim=0)).abs().max()
-        difference = (given - model).abs().amax(dim=0)
+        difference = (given - model).abs().amax(dim=(0, 1))
         if bool((difference[:, :3] < 1e-3).all()) and bool((difference[:, 3] <= 1e-3 * span).all()):
-            ids = {frame.name: image_id for (image_id, _), frame in zip(images, frames, strict=True)}
+            ids = {frame.name: images[row][0] for row, frame in zip(order, frames, strict=True)}
             return track_points(folder, {ids[frame.name] for frame in train})
     raise DataError(folder, "points", "model-points are not available: the model's poses are not those of the scene")

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from kgs.datasets.layouts.colmap_model import read_cameras, read_images, read_points
+from kgs.datasets.layouts.colmap_model import read_cameras, read_frames, read_images, read_points, read_rigs
 from kgs.errors import DataError
 
 CAMERA = struct.pack("<QIiQQ4d", 1, 3, 1, 8, 6, 5.0, 6.0, 4.0, 3.0)
@@ -17,6 +18,8 @@ IMAGES = (
     + b"\0"
     + struct.pack("<Qddq", 1, 1.0, 2.0, -1)
 )
+RIGS = struct.pack("<QIIiIiIB7diIB", 1, 5, 3, 0, 3, 0, 4, 1, 1, 0, 0, 0, 0.5, 0.25, 2, 1, 7, 0)
+FRAMES = struct.pack("<QII7dIiIQiIQ", 1, 6, 5, 1, 0, 0, 0, 0.5, 0.25, 2, 2, 0, 3, 9, 1, 7, 8)
 POINTS = struct.pack("<QQ3d3BdQ4I", 1, 77, 1.0, 2.0, 3.0, 10, 20, 30, 0.5, 2, 9, 0, 4, 1)
 
 
@@ -30,38 +33,49 @@ def test_hand_packed_bytes(tmp_path: Path) -> None:
     assert (camera.model, camera.width, camera.height, camera.params) == ("PINHOLE", 8, 6, (5.0, 6.0, 4.0, 3.0))
     image = read_images(packed(tmp_path, "images.bin", IMAGES))[9]
     assert (image.name, image.camera_id) == ("bücher/ä.png", 3)
-    assert (image.quat, image.translation) == ((1, 0, 0, 0), (0.5, 0.25, 2))
+    assert image.pose == ((1, 0, 0, 0), (0.5, 0.25, 2))
+    rig = read_rigs(packed(tmp_path, "rigs.bin", RIGS))
+    assert rig == {5: {3: ((1, 0, 0, 0), (0, 0, 0)), 4: ((1, 0, 0, 0), (0.5, 0.25, 2))}}  # and a sensor of motion
+    frames = read_frames(packed(tmp_path, "frames.bin", FRAMES))
+    assert frames == {6: (5, ((1, 0, 0, 0), (0.5, 0.25, 2)), {9: 3})}
     path = packed(tmp_path, "points3D.bin", POINTS)
     points, colors = read_points(path, {4, 9})
     assert (points.tolist(), colors.tolist()) == ([[1.0, 2.0, 3.0]], [[10, 20, 30]])
     assert read_points(path, {4, 5})[0].shape == (0, 3)
 
 
-@pytest.mark.parametrize(("name", "data"), [("cameras.bin", CAMERA), ("images.bin", IMAGES), ("points3D.bin", POINTS)])
-def test_every_truncation_and_any_extra_byte_is_noticed(tmp_path: Path, name: str, data: bytes) -> None:
-    def read(path: Path) -> None:
-        if "points" in name:
-            read_points(path, {4, 9})
-        else:
-            (read_cameras if "cameras" in name else read_images)(path)
+READERS: dict[str, Callable[[Path], object]] = {
+    "cameras.bin": read_cameras,
+    "images.bin": read_images,
+    "rigs.bin": read_rigs,
+    "frames.bin": read_frames,
+    "points3D.bin": lambda path: read_points(path, {4, 9}),
+}
 
+
+@pytest.mark.parametrize(("name", "data"), list(zip(READERS, (CAMERA, IMAGES, RIGS, FRAMES, POINTS), strict=True)))
+def test_every_truncation_and_any_extra_byte_is_noticed(tmp_path: Path, name: str, data: bytes) -> None:
     for broken in [data[:size] for size in range(len(data))] + [data + b"\0"]:
         with pytest.raises(DataError, match=name):
-            read(packed(tmp_path, name, broken))
+            READERS[name](packed(tmp_path, name, broken))
 
 
-@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+@pytest.mark.parametrize("name", READERS)
 @pytest.mark.parametrize("count", [2**40, 2**64 - 1])
 def test_a_lying_count_is_held_against_the_file(tmp_path: Path, name: str, count: int) -> None:
     path = packed(tmp_path, name, struct.pack("<Q", count) + b"\0" * 100)
     with pytest.raises(DataError, match=r"needs \d+ bytes"):
-        read_points(path, {1}) if "points" in name else (read_cameras if "cam" in name else read_images)(path)
+        READERS[name](path)
 
 
 def test_lying_lengths_within(tmp_path: Path) -> None:
     track = POINTS[:-24] + struct.pack("<Q4I", 2**61, 9, 0, 4, 1)
     with pytest.raises(DataError, match="track"):
         read_points(packed(tmp_path, "points3D.bin", track), {4, 9})
+    for name, data in (("rigs.bin", RIGS), ("frames.bin", FRAMES)):
+        at = 12 if name == "rigs.bin" else 72
+        with pytest.raises(DataError, match=r"needs \d+ bytes"):
+            READERS[name](packed(tmp_path, name, data[:at] + struct.pack("<I", 2**32 - 1) + data[at + 4 :]))
     endless = IMAGES[:72] + b"x" * 10_000
     with pytest.raises(DataError, match="zero byte"):
         read_images(packed(tmp_path, "images.bin", endless))
@@ -80,7 +94,7 @@ def test_texts_with_and_without_second_lines(tmp_path: Path, between: str, end: 
     text = "# Image list\n" + f"\n{between}".join(HEADS) + end
     images = read_images(packed(tmp_path, "images.txt", text.encode()))
     assert [image.name for image in images.values()] == ["a.png", "b c.png", "7", "d e f.png"]
-    assert [image.translation for image in images.values()] == [(i + 0.5, 0.25, 2) for i in range(1, 5)]
+    assert [image.pose.translation for image in images.values()] == [(i + 0.5, 0.25, 2) for i in range(1, 5)]
 
 
 def test_texts_where_only_some_photos_have_second_lines(tmp_path: Path) -> None:
@@ -92,6 +106,26 @@ def test_texts_where_only_some_photos_have_second_lines(tmp_path: Path) -> None:
 def test_second_lines_that_are_none_are_refused(tmp_path: Path, line: str) -> None:
     with pytest.raises(DataError, match=r"images\.txt"):
         read_images(packed(tmp_path, "images.txt", f"{HEADS[1]}\n{line}\n{HEADS[2]}\n".encode()))
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_each_camera_model_of_pycolmap_is_read_or_refused_by_its_name(tmp_path: Path, text: bool) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    refused = {"FOV", "SIMPLE_DIVISION", "DIVISION", "EUCM", "EQUIRECTANGULAR"}
+    refused |= {"THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"}
+    models = {name: number for name, number in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
+    assert refused < models.keys()
+    path = tmp_path / ("cameras.txt" if text else "cameras.bin")
+    for name, number in models.items():
+        camera = pycolmap.Camera.create_from_model_id(7, number, 40.0, 48, 32)
+        scene = pycolmap.Reconstruction()
+        scene.add_camera_with_trivial_rig(camera)
+        (scene.write_text if text else scene.write_binary)(str(tmp_path))
+        if name in refused:
+            with pytest.raises(DataError, match=f"camera 7: camera model {name} cannot be read, .*image_undistorter"):
+                read_cameras(path)
+        else:
+            assert read_cameras(path) == {7: (name, 48, 32, tuple(camera.params))}
 
 
 @pytest.mark.parametrize(("number", "name"), [(7, "FOV"), (10, "THIN_PRISM_FISHEYE"), (99, "number 99"), (-1, "-1")])
