@@ -194,11 +194,12 @@ def _rows_of_gaussians(path: Path, table: NDArray[np.float32], names: list[str])
     A DataError if the values of half of the rows or more are not: then the file is damaged, or of another kind.
     """
     invalid = _invalid(table, names)
-    valid_rows: NDArray[np.bool_] = ~invalid.any(axis=1)
-    if 2 * int(valid_rows.sum()) <= len(table) and len(table):
+    is_valid = np.logical_not(invalid.any(axis=1))
+    if 2 * int(is_valid.sum()) <= len(table) and len(table):
         row, column = np.argwhere(invalid)[0]
         raise DataError(path, names[column], f"expected finite float32 values, got {table[row, column]} in row {row}")
-    return valid_rows & table[:, -4:].any(axis=1)
+    rows: NDArray[np.bool_] = is_valid & table[:, -4:].any(axis=1)
+    return rows
 
 
 def _count_left_out(table: NDArray[np.float32], kept: NDArray[np.bool_]) -> str:
