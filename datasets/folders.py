@@ -17,11 +17,28 @@ UNREADABLE_SUFFIXES = (*_RAW, *HEIC_SUFFIXES, ".avif", ".gif", ".jxl", ".jp2", "
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mpg", ".mpeg", ".mts")
 # What says where the cameras of a scene are, in the order in which it is looked for; a COLMAP model comes second.
 LAYOUT_FILES = {"LLFF": "poses_bounds.npy", "Blender": "transforms_train.json", "nerfstudio": "transforms.json"}
+_AS_MODEL = "export the cameras of {} as a COLMAP model to use them"
+_CONVERTED = "it is of {}: nerfstudio's ns-process-data {} makes a scene of the export; kgs fit takes the photos alone"
+_ALONE = "it has the poses of {}, which are not read: kgs fit takes the photos alone"
+# Of programs and data sets whose poses are not read: the files that show it, all of them, and what to do.
 _NOT_READ = {
-    "reconstruction.json": "OpenSfM",
-    "cameras.sfm": "Meshroom",
-    "cameras.xml": "Metashape",
-    "bundle.out": "Bundler",
+    ("reconstruction.json",): _AS_MODEL.format("OpenSfM"),
+    ("cameras.sfm",): _AS_MODEL.format("Meshroom"),
+    ("sfm_data.json",): _AS_MODEL.format("OpenMVG"),
+    ("cameras.xml",): _AS_MODEL.format("Metashape"),
+    ("bundle.out",): _AS_MODEL.format("Bundler"),
+    ("*.nvm",): _AS_MODEL.format("VisualSFM"),
+    ("keyframes/*cameras/*.json",): _CONVERTED.format("Polycam", "polycam"),
+    ("metadata.json", "rgb/0.*"): _CONVERTED.format("Record3D", "record3d"),
+    ("EXR_RGBD/metadata.json",): _CONVERTED.format("Record3D", "record3d"),
+    ("*.r3d",): "it is a recording of Record3D: export it as EXR and JPG, for nerfstudio's ns-process-data record3d",
+    ("odometry.csv", "camera_matrix.csv"): _ALONE.format("Stray Scanner"),
+    ("info.json", "frame_*.json"): _ALONE.format("3D Scanner App"),
+    ("lowres_wide.traj",): _ALONE.format("ARKitScenes"),
+    ("pose/*.txt", "intrinsic/*.txt"): _ALONE.format("ScanNet"),
+    ("pose/*.txt", "intrinsics.txt"): _ALONE.format("NSVF"),
+    ("cameras_sphere.npz",): _ALONE.format("NeuS"),
+    ("cams/*_cam.txt",): _ALONE.format("MVSNet"),
 }
 _MISSPELLED = {
     "transform.json": "transforms.json",
@@ -108,9 +125,9 @@ def unused_files(root: Path) -> tuple[str, ...]:
         sentences.append("the COLMAP model is not used: expected its photos beside it or in images/")
     if _is_model(root) and layout in ("Blender", "nerfstudio"):
         sentences.append(f"the COLMAP model is not used: the scene is read as {layout}")
-    for name, program in _NOT_READ.items():
-        if (root / name).is_file():
-            sentences.append(f"{name} is not used: export the cameras of {program} as a COLMAP model to use them")
+    for patterns, advice in _NOT_READ.items():
+        if all(any(root.glob(pattern)) for pattern in patterns):
+            sentences.append(f"{' with '.join(patterns)} is not used: {advice}")
     for name, right in _MISSPELLED.items():
         if (root / name).is_file():
             sentences.append(f"{name} is not used: expected the name {right}")
@@ -153,7 +170,12 @@ def _about_file(path: Path) -> str:
         return "expected a folder, there is none"
     if path.suffix.lower() in VIDEO_SUFFIXES:
         return f"expected a folder, got a video: {_NO_PHOTOS}"
-    return "expected a folder, got a file" + (f": the scene is {path.parent}" if layout_of(path.parent) else "")
+    if layout_of(path.parent):
+        return f"expected a folder, got a file: the scene is {path.parent}"
+    advice = [advice for patterns, advice in _NOT_READ.items() if len(patterns) == 1 and path.match(patterns[0])]
+    if path.suffix.lower() == ".zip":
+        advice = ["it is an archive: unpack it first"]
+    return ": ".join(["expected a folder, got a file", *advice[:1]])
 
 
 def _about_folder(root: Path) -> str:

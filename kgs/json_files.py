@@ -12,12 +12,12 @@ from .errors import DataError
 _MOST_BYTES = 64 * 2**20
 
 
-def read_json(path: Path) -> dict[str, Any]:
+def read_json(path: Path, finite: bool = True) -> dict[str, Any]:
     """Read a JSON object; a DataError if the file is missing, over 64 MiB, no object, or refused by `parse_json`."""
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise DataError(path, "", f"is larger than {_MOST_BYTES // 2**20} MiB")
-        value = parse_json(path.read_bytes())
+        value = parse_json(path.read_bytes(), finite)
     except OSError as error:
         raise DataError(path, "", f"cannot be read ({error.strerror})") from error
     except ValueError as error:
@@ -50,14 +50,18 @@ def write_whole(path: Path, content: bytes) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def parse_json(text: bytes) -> Any:
+def parse_json(text: bytes, finite: bool = True) -> Any:
     """The value of UTF-8 text, which may begin with a byte order mark.
+
+    `finite=False` reads NaN, Infinity and numbers beyond float64, as many programs write them, for a caller that can
+    say where they are.
 
     Raises:
         ValueError: it is not JSON (NaN and Infinity are not), nested too deep, or holds a number beyond float64.
     """
+    number = _finite if finite else float
     try:
-        return json.loads(text.decode("utf-8-sig"), parse_constant=_finite, parse_float=_finite)
+        return json.loads(text.decode("utf-8-sig"), parse_constant=number, parse_float=number)
     except RecursionError as error:
         raise ValueError("nested too deep") from error
 

@@ -96,7 +96,7 @@ def read_transforms(root: Path, name: str) -> tuple[list[Frame], Object, tuple[s
 
     A DataError if the file cannot be read, lacks a field, or has entries about lenses or poses that cannot be used.
     """
-    data = read_json(source := root / name)
+    data = read_json(source := root / name, finite=False)  # `is_number` refuses what is not finite, where it is used
     entries = data.get("frames")
     if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
         raise DataError(source, "frames", "expected a list of objects, not empty")
@@ -129,7 +129,7 @@ def _mask(source: Path, root: Path, values: Values) -> Mask | None:
         return None
     path = find_file(source, root, name)
     if not path.is_file():
-        raise DataError(source, "mask_path", f"expected a file, got {name[:200]!r}, which is not there")
+        raise DataError(source, _field("mask_path", values), f"expected a file, got {name[:200]!r}, which is not there")
     return Mask(ImageFile(path))
 
 
@@ -159,7 +159,9 @@ def _check_keys(source: Path, objects: Iterable[Values]) -> tuple[str, ...]:
             if key in known or _is_empty(value) or _is_harmless(key, value, values):
                 continue
             if _GEOMETRY.search(key) or key.endswith("_filenames"):
-                raise DataError(source, key[:60], f"cannot be used: expected none, 0 or false, got {_shown(value)}")
+                raise DataError(
+                    source, _field(key, values), f"cannot be used: expected none, 0 or false, got {_shown(value)}"
+                )
             unused.add(key[:60])
     return (f"{source.name}: not used: {', '.join(sorted(unused)[:20])}",) if unused else ()
 
@@ -194,7 +196,7 @@ def _lens(source: Path, values: Values, size: tuple[int, ...]) -> Intrinsics:
     for key in _COEFFICIENTS:
         if key not in used and (value := _number(source, key, of_this_lens, 0.0)) != 0:
             kind = "a fisheye lens" if fisheye else "a lens that is not a fisheye, where tools disagree on its meaning"
-            raise DataError(source, key, f"expected 0 for {kind}, got {value:g}")
+            raise DataError(source, _field(key, values), f"expected 0 for {kind}, got {value:g}")
     distortion = tuple(_number(source, key, values, 0.0) for key in used)
     cx = _number(source, "cx", values, width / 2)
     cy = _number(source, "cy", values, height / 2)
@@ -209,11 +211,13 @@ def _is_fisheye(source: Path, values: Values) -> bool:
     if "camera_make" in values and model not in known and not _OTHER_LENS.search(model):
         model = ""  # of the device, as in Exif
     if model not in ("", *known):
-        raise DataError(source, "camera_model", f"{model[:60]} cannot be read, only {', '.join(known)}")
+        raise DataError(source, _field("camera_model", values), f"{model[:60]} cannot be read, only {', '.join(known)}")
     if flag is not None and not (isinstance(flag, int) and flag in (0, 1)):
-        raise DataError(source, "is_fisheye", f"expected true or false, got {_shown(flag)}")
+        raise DataError(source, _field("is_fisheye", values), f"expected true or false, got {_shown(flag)}")
     if flag is not None and model and bool(flag) != (model == _FISHEYE):
-        raise DataError(source, "is_fisheye", f"is {str(bool(flag)).lower()}, but camera_model is {model}")
+        raise DataError(
+            source, _field("is_fisheye", values), f"is {str(bool(flag)).lower()}, but camera_model is {model}"
+        )
     return bool(flag) or model == _FISHEYE
 
 
@@ -225,21 +229,28 @@ def _focal(source: Path, axis: str, values: Values, length: float) -> float | No
         if (key := f"camera_angle_{axis}") in item:
             angle = _number(source, key, item, None)
             if not 0 < angle / 2 < math.pi / 2:
-                raise DataError(source, key, f"expected an angle between 0 and pi, got {angle:g}")
+                raise DataError(source, _field(key, item), f"expected an angle between 0 and pi, got {angle:g}")
             return length / (2 * math.tan(angle / 2))
     return None
 
 
 def _number(path: Path, key: str, values: Mapping[str, Any], default: float | None) -> float:
     if not is_number(value := values.get(key, default)):
-        raise DataError(path, key, f"expected a finite number, got {_shown(value)}")
+        raise DataError(path, _field(key, values), f"expected a finite number, got {_shown(value)}")
     return float(value)
 
 
 def _text(path: Path, key: str, values: Mapping[str, Any], default: str | None) -> str:
     if not isinstance(value := values.get(key, default), str):
-        raise DataError(path, key, f"expected a text, got {_shown(value)}")
+        raise DataError(path, _field(key, values), f"expected a text, got {_shown(value)}")
     return value
+
+
+def _field(key: str, values: Mapping[str, Any]) -> str:
+    """How an error names a key: with the photo of its frame, unless it holds for all frames."""
+    own = values.maps[0] if isinstance(values, ChainMap) else values
+    name = own.get("file_path")
+    return f"{key[:60]} of {name[:200]}" if key in own and key != "file_path" and isinstance(name, str) else key[:60]
 
 
 def _shown(value: Any) -> str:
@@ -250,10 +261,13 @@ def _opencv_pose(path: Path, frame: Object) -> Tensor:
     """A frame's `transform_matrix`, 4x4 or 3x4, as camera-to-world with OpenCV axes, `(4, 4)` float64."""
     rows = frame.get("transform_matrix")
     name = f"transform_matrix of {str(frame.get('file_path'))[:200]}"
+    expected = "expected a 4x4 matrix of finite numbers"
     rows = rows if isinstance(rows, list) and all(isinstance(row, list) and len(row) == 4 for row in rows) else []
     rows = [*rows, [0, 0, 0, 1]] if len(rows) == 3 else rows
-    if len(rows) != 4 or not all(is_number(x) for row in rows for x in row):
-        raise DataError(path, name, "expected a 4x4 matrix of finite numbers")
+    if len(rows) != 4:
+        raise DataError(path, name, expected)
+    if wrong := [x for row in rows for x in row if not is_number(x)]:
+        raise DataError(path, name, f"{expected}, got {_shown(wrong[0])}")
     matrix = torch.tensor([[float(x) for x in row] for row in rows], dtype=torch.float64)[None]
     last = matrix.new_tensor([0.0, 0.0, 0.0, 1.0])
     if float((matrix[0, 3] - last).abs().max()) > 1e-6:  # an inverse is off by rounding

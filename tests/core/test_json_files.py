@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 from pathlib import Path
 
 import pytest
@@ -48,6 +49,15 @@ def test_files_that_are_refused(tmp_path: Path, text: bytes, reason: str) -> Non
     (tmp_path / "a.json").write_bytes(text)
     with pytest.raises(DataError, match=reason):
         read_json(tmp_path / "a.json")
+
+
+def test_numbers_that_are_not_finite_are_read_on_request(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_bytes(b'{"a": [-Infinity, 1e400, 1.5, 2], "b": NaN}')
+    value = read_json(tmp_path / "a.json", finite=False)
+    assert value["a"] == [-math.inf, math.inf, 1.5, 2]
+    assert math.isnan(value["b"])
+    with pytest.raises(ValueError, match="Expecting value"):
+        parse_json(b"infinity", finite=False)
 
 
 def test_a_byte_order_mark_and_repeated_keys_are_read(tmp_path: Path) -> None:

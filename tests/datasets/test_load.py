@@ -44,6 +44,31 @@ IN_ORDER = [
     (["transforms.json"], r"transforms\.json"),
     *[([*PHOTOS, other], f"{other} is not used") for other in ("reconstruction.json", "transform_train.json")],
 ]
+OTHER_PROGRAMS = [
+    (["keyframes/cameras/12.json", "keyframes/images/12.jpg"], "Polycam.*ns-process-data polycam.*photos alone"),
+    (["keyframes/corrected_cameras/1.json", "keyframes/cameras/1.json"], "Polycam"),
+    (
+        ["metadata.json", "rgb/0.jpg", "rgb/1.jpg", "depth/0.exr"],
+        "metadata.json with .*Record3D.*ns-process-data record3d",
+    ),
+    (["EXR_RGBD/metadata.json", "EXR_RGBD/rgb/0.jpg"], "Record3D"),
+    (["scan.r3d"], "Record3D: export it as EXR and JPG"),
+    (["odometry.csv", "camera_matrix.csv", "rgb.mp4"], "Stray Scanner"),
+    (
+        ["info.json", "frame_00000.json", "frame_00000.jpg"],
+        "1 photos but no camera poses.*3D Scanner App.*photos alone",
+    ),
+    (["lowres_wide.traj", "lowres_wide/1.png"], "ARKitScenes"),
+    (["pose/0.txt", "intrinsic/intrinsic_color.txt", "color/0.jpg"], "ScanNet"),
+    (["pose/0_train_0000.txt", "intrinsics.txt", "rgb/0_train_0000.png"], "NSVF"),
+    (["cameras_sphere.npz", "image/000000.png"], "NeuS"),
+    (["cams/00000000_cam.txt", "images/00000000.jpg"], "MVSNet"),
+    (["sfm_data.json", *PHOTOS], "OpenMVG as a COLMAP model"),
+    (["cameras.sfm", *PHOTOS], "Meshroom as a COLMAP model"),
+    (["cameras.xml", *PHOTOS], "Metashape as a COLMAP model"),
+    (["bundle.out", *PHOTOS], "Bundler as a COLMAP model"),
+    (["model.nvm", *PHOTOS], "VisualSFM as a COLMAP model"),
+]
 
 
 @pytest.mark.parametrize(
@@ -53,7 +78,8 @@ IN_ORDER = [
         for folder in (".", "images", "images_4")
         for names, said in WITHOUT_POSES
     ]
-    + IN_ORDER,
+    + IN_ORDER
+    + OTHER_PROGRAMS,
 )
 def test_what_is_no_scene_is_named(tmp_path: Path, names: list[str], message: str) -> None:
     for name in names:
@@ -65,7 +91,14 @@ def test_what_is_no_scene_is_named(tmp_path: Path, names: list[str], message: st
 
 
 @pytest.mark.parametrize(
-    ("name", "message"), [("nowhere", "there is none"), ("transforms.json", "got a file"), ("walk.mov", "got a video")]
+    ("name", "message"),
+    [
+        ("nowhere", "there is none"),
+        ("transforms.json", "got a file"),
+        ("walk.mov", "got a video"),
+        ("scan.r3d", "got a file: it is a recording of Record3D: export it as EXR and JPG"),
+        ("poly.zip", "got a file: it is an archive: unpack it first"),
+    ],
 )
 def test_a_scene_is_a_folder(tmp_path: Path, name: str, message: str) -> None:
     if name != "nowhere":

@@ -130,6 +130,11 @@ REFUSED: list[tuple[str, Any]] = [
     ("is_fisheye", "yes"),
     ("camera_model", "EQUIRECTANGULAR"),
     ("camera_model", "FISHEYE624"),
+    ("camera_model", "ORTHOPHOTO"),
+    ("camera_model", "OMNIDIRECTIONALSTEREO_L"),
+    ("camera_model", "VR180_R"),
+    ("camera_model", "SIMPLE_FISHEYE"),
+    ("camera_model", "FULL_OPENCV"),
     ("k1", "0.1"),
     ("fl_x", -50.0),
     ("fl_y", -50.0),
@@ -145,6 +150,44 @@ def test_what_cannot_be_used_is_refused(tmp_path: Path, layout: str, where: str,
     with pytest.raises(DataError, match="focal length" if key.startswith("fl_") else key) as error:
         load_scene(tmp_path)
     assert Path(error.value.path).parent == path.parent
+
+
+NOT_FINITE = ["-Infinity", "Infinity", "NaN", "1e999"]
+
+
+@BOTH
+@pytest.mark.parametrize("written", NOT_FINITE)
+def test_a_frame_whose_pose_is_not_finite_is_named(tmp_path: Path, layout: str, written: str) -> None:
+    path = write(tmp_path, layout, LENS)
+    path.write_text(path.read_text().replace("[1.0, 0.0, 0.0, 2.0]", f"[1.0, 0.0, 0.0, {written}]"))
+    with pytest.raises(
+        DataError, match=r"transform_matrix of images/2\.png: expected a 4x4 matrix of finite numbers, got"
+    ):
+        load_scene(tmp_path)
+
+
+@BOTH
+@pytest.mark.parametrize("written", NOT_FINITE)
+@pytest.mark.parametrize("key", ["fl_x", "cx", "w", "k1", "k5", "camera_angle_y", "skew"])
+def test_a_lens_that_is_not_finite_is_named(tmp_path: Path, layout: str, key: str, written: str) -> None:
+    lens = {name: value for name, value in LENS.items() if (name, key) != ("fl_y", "camera_angle_y")}
+    path = write(tmp_path, layout, {**lens, key: 1234.5})
+    before = path.read_text()
+    path.write_text(before.replace("1234.5", written))
+    with pytest.raises(DataError, match=rf"transforms\S*: {key}: .*got (-?inf|nan)"):
+        load_scene(tmp_path)
+    path = write(tmp_path, layout, lens, {}, {}, {key: 1234.5})
+    path.write_text(path.read_text().replace("1234.5", written))
+    with pytest.raises(DataError, match=rf"{key} of images/2\.png: .*got (-?inf|nan)"):
+        load_scene(tmp_path)
+
+
+@BOTH
+@pytest.mark.parametrize("key", ["sharpness", "pose_confidence", "aabb_scale", "note"])
+def test_what_is_not_used_may_be_not_finite(tmp_path: Path, layout: str, key: str) -> None:
+    path = write(tmp_path, layout, LENS, {}, {key: 1234.5})
+    path.write_text(path.read_text().replace("1234.5", "NaN"))
+    assert len(load_scene(tmp_path).train) == COUNT - 1
 
 
 LENSES: list[tuple[dict[str, Any], str]] = [
