@@ -174,18 +174,18 @@ def _read(root: Path, points: str = "none", downscale: float | None = None) -> N
     check_scene(load_scene(root, downscale=downscale, points=points))
 
 
-_MODEL = ("cameras", "images", "points3D")
+_MODEL = ("cameras", "images", "points3D", "rigs", "frames")
 SCENE_READERS = (
     Reader("LLFF", write_llff, partial(_read, downscale=2), (("poses_bounds.npy", damaged_bytes),)),
     Reader(
         "COLMAP, binary",
-        write_colmap,
+        partial(write_colmap, rig=True),
         partial(_read, points="model-points"),
         tuple((f"sparse/0/{stem}.bin", damaged_bytes) for stem in _MODEL),
     ),
     Reader(
         "COLMAP, text",
-        partial(write_colmap, text=True),
+        partial(write_colmap, text=True, rig=True),
         partial(_read, points="model-points"),
         tuple((f"sparse/0/{stem}.txt", damaged_text) for stem in _MODEL),
     ),

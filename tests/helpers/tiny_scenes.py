@@ -46,8 +46,8 @@ def write_llff(root: Path) -> None:
     write_photos(root / "images")
 
 
-def write_colmap(root: Path, text: bool = False) -> None:
-    """Two lenses, three photos, two points; as COLMAP writes them."""
+def write_colmap(root: Path, text: bool = False, rig: bool = False) -> None:
+    """Two lenses, three photos, two points; as COLMAP writes them, from version 3.12 on with a rig and its frames."""
     folder = root / "sparse" / "0"
     folder.mkdir(parents=True)
     write_photos(root / "images")
@@ -65,7 +65,11 @@ def write_colmap(root: Path, text: bool = False) -> None:
             f"{i} {_words(q)} {_words(t)} {camera} {name}\n3.5 4.5 7 5.5 6.5 -1" for i, q, t, camera, name in images
         ]
         dots = [f"{i} {_words(xyz)} {_words(rgb)} 0.5 {_words(track)}" for i, xyz, rgb, track in points]
-        for stem, lines in (("cameras", lens), ("images", pose), ("points3D", dots)):
+        parts = {"cameras": lens, "images": pose, "points3D": dots}
+        if rig:
+            parts["rigs"] = ["5 2 CAMERA 1 CAMERA 2 1 1.0 0.0 0.0 0.0 0.0 0.0 0.0"]
+            parts["frames"] = [f"{i} 5 {_words(q)} {_words(t)} 1 CAMERA {camera} {i}" for i, q, t, camera, _ in images]
+        for stem, lines in parts.items():
             (folder / f"{stem}.txt").write_text("\n".join([f"# {stem}", *lines, ""]))
         return
     data = struct.pack("<Q", 2)
@@ -81,6 +85,13 @@ def write_colmap(root: Path, text: bool = False) -> None:
     for i, xyz, rgb, track in points:
         data += struct.pack(f"<Q3d3BdQ{len(track)}I", i, *xyz, *rgb, 0.5, len(track) // 2, *track)
     (folder / "points3D.bin").write_bytes(data)
+    if rig:
+        data = struct.pack("<QIIiIiIB7d", 1, 5, 2, 0, 1, 0, 2, 1, 1, 0, 0, 0, 0, 0, 0)
+        (folder / "rigs.bin").write_bytes(data)
+        data = struct.pack("<Q", 3)
+        for i, quat, shift, camera, _ in images:
+            data += struct.pack("<II7dIiIQ", i, 5, *quat, *shift, 1, 0, camera, i)
+        (folder / "frames.bin").write_bytes(data)
 
 
 def _words(numbers: tuple[float, ...]) -> str:
