@@ -18,8 +18,8 @@ VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mpg
 # What says where the cameras of a scene are, in the order in which it is looked for; a COLMAP model comes second.
 LAYOUT_FILES = {"LLFF": "poses_bounds.npy", "Blender": "transforms_train.json", "nerfstudio": "transforms.json"}
 _AS_MODEL = "export the cameras of {} as a COLMAP model to use them"
-_CONVERTED = "it is of {}: nerfstudio's ns-process-data {} makes a scene of the export; kgs fit takes the photos alone"
-_ALONE = "it has the poses of {}, which are not read: kgs fit takes the photos alone"
+_CONVERTED = "it is of {}: nerfstudio's ns-process-data {} makes a scene of the export; kgs fit takes {} alone"
+_ALONE = "it has the poses of {}, which are not read: kgs fit takes {} alone"
 # Of programs and data sets whose poses are not read: the files that show it, all of them, and what to do.
 _NOT_READ = {
     ("reconstruction.json",): _AS_MODEL.format("OpenSfM"),
@@ -28,17 +28,19 @@ _NOT_READ = {
     ("cameras.xml",): _AS_MODEL.format("Metashape"),
     ("bundle.out",): _AS_MODEL.format("Bundler"),
     ("*.nvm",): _AS_MODEL.format("VisualSFM"),
-    ("keyframes/*cameras/*.json",): _CONVERTED.format("Polycam", "polycam"),
-    ("metadata.json", "rgb/0.*"): _CONVERTED.format("Record3D", "record3d"),
-    ("EXR_RGBD/metadata.json",): _CONVERTED.format("Record3D", "record3d"),
+    ("keyframes/*cameras/*.json",): _CONVERTED.format("Polycam", "polycam", "keyframes/images"),
+    ("metadata.json", "*.exr"): _CONVERTED.format("Record3D", "record3d", "rgb"),
+    ("metadata.json", "*/*.exr"): _CONVERTED.format("Record3D", "record3d", "rgb"),
+    ("EXR_RGBD/metadata.json",): _CONVERTED.format("Record3D", "record3d", "EXR_RGBD/rgb"),
     ("*.r3d",): "it is a recording of Record3D: export it as EXR and JPG, for nerfstudio's ns-process-data record3d",
-    ("odometry.csv", "camera_matrix.csv"): _ALONE.format("Stray Scanner"),
-    ("info.json", "frame_*.json"): _ALONE.format("3D Scanner App"),
-    ("lowres_wide.traj",): _ALONE.format("ARKitScenes"),
-    ("pose/*.txt", "intrinsic/*.txt"): _ALONE.format("ScanNet"),
-    ("pose/*.txt", "intrinsics.txt"): _ALONE.format("NSVF"),
-    ("cameras_sphere.npz",): _ALONE.format("NeuS"),
-    ("cams/*_cam.txt",): _ALONE.format("MVSNet"),
+    ("opensfm/reconstruction.json",): _CONVERTED.format("OpenDroneMap", "odm", "images"),
+    ("odometry.csv", "camera_matrix.csv"): _ALONE.format("Stray Scanner", "rgb.mp4"),
+    ("info.json", "frame_*.json"): _ALONE.format("3D Scanner App", "its photos"),
+    ("lowres_wide.traj",): _ALONE.format("ARKitScenes", "lowres_wide"),
+    ("pose/*.txt", "intrinsic/*.txt"): _ALONE.format("ScanNet", "color"),
+    ("pose/*.txt", "intrinsics.txt"): _ALONE.format("NSVF", "rgb"),
+    ("cameras_sphere.npz",): _ALONE.format("NeuS", "image"),
+    ("cams/*_cam.txt",): _ALONE.format("MVSNet", "images"),
 }
 _MISSPELLED = {
     "transform.json": "transforms.json",

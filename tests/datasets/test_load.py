@@ -45,18 +45,26 @@ IN_ORDER = [
     *[([*PHOTOS, other], f"{other} is not used") for other in ("reconstruction.json", "transform_train.json")],
 ]
 OTHER_PROGRAMS = [
-    (["keyframes/cameras/12.json", "keyframes/images/12.jpg"], "Polycam.*ns-process-data polycam.*photos alone"),
+    (
+        ["keyframes/cameras/12.json", "keyframes/images/12.jpg"],
+        "Polycam.*ns-process-data polycam.*keyframes/images alone",
+    ),
     (["keyframes/corrected_cameras/1.json", "keyframes/cameras/1.json"], "Polycam"),
     (
         ["metadata.json", "rgb/0.jpg", "rgb/1.jpg", "depth/0.exr"],
         "metadata.json with .*Record3D.*ns-process-data record3d",
     ),
     (["EXR_RGBD/metadata.json", "EXR_RGBD/rgb/0.jpg"], "Record3D"),
+    (["metadata.json", "0.exr"], "Record3D"),
+    (
+        ["opensfm/reconstruction.json", "images/a.jpg"],
+        "1 photos but no camera poses.*OpenDroneMap.*ns-process-data odm",
+    ),
     (["scan.r3d"], "Record3D: export it as EXR and JPG"),
-    (["odometry.csv", "camera_matrix.csv", "rgb.mp4"], "Stray Scanner"),
+    (["odometry.csv", "camera_matrix.csv", "rgb.mp4"], "Stray Scanner.*kgs fit takes rgb.mp4 alone"),
     (
         ["info.json", "frame_00000.json", "frame_00000.jpg"],
-        "1 photos but no camera poses.*3D Scanner App.*photos alone",
+        "1 photos but no camera poses.*3D Scanner App.*kgs fit takes its photos alone",
     ),
     (["lowres_wide.traj", "lowres_wide/1.png"], "ARKitScenes"),
     (["pose/0.txt", "intrinsic/intrinsic_color.txt", "color/0.jpg"], "ScanNet"),
