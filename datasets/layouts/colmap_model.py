@@ -25,10 +25,7 @@ _LONGEST_NAME = 4096
 _MODELS = dict(SIMPLE_PINHOLE=3, PINHOLE=4, SIMPLE_RADIAL=4, RADIAL=5, OPENCV=8, OPENCV_FISHEYE=8, FULL_OPENCV=12)
 _MODELS |= dict(FOV=0, SIMPLE_RADIAL_FISHEYE=4, RADIAL_FISHEYE=5, THIN_PRISM_FISHEYE=0, RAD_TAN_THIN_PRISM_FISHEYE=0)
 _MODELS |= dict(SIMPLE_DIVISION=0, DIVISION=0, SIMPLE_FISHEYE=3, FISHEYE=4, EUCM=0, EQUIRECTANGULAR=0)
-_SENSORS = {"CAMERA": 0, "IMU": 1}  # COLMAP's numbers of the kinds
-_CAMERA = _SENSORS["CAMERA"]
-# What words of a text stand for, by the code that their numbers have in a binary file.
-_WORDS: dict[str, Callable[[str], Any]] = {"i": _SENSORS.__getitem__, "I": int, "Q": int, "B": int, "d": float}
+_CAMERA = 0  # COLMAP's number of this kind of sensor
 _SUFFIXES = ("bin", "txt")
 
 
@@ -236,6 +233,15 @@ class _Binary:
             raise DataError(self._path, what, f"needs {size} bytes at byte {self._at}, the file has {left} more")
 
 
+def _kind(word: str) -> int:
+    """The number of a kind of sensor, -1 for all that are no cameras."""
+    return _CAMERA if word == "CAMERA" else -1
+
+
+# What words of a text stand for, by the code that their numbers have in a binary file.
+_WORDS: dict[str, Callable[[str], Any]] = {"i": _kind, "I": int, "Q": int, "B": int, "d": float}
+
+
 class _Line:
     """A line of a text model, whose words are read in order as `_Binary` reads numbers."""
 
@@ -249,10 +255,9 @@ class _Line:
         words = list(islice(self._words, len(codes)))
         try:
             return tuple(_WORDS[code](word) for code, word in zip(codes, words, strict=True))
-        except (KeyError, ValueError) as error:
-            raise DataError(
-                self._path, what, f"expected a line as COLMAP writes it, got {self._line[:60]!r}"
-            ) from error
+        except ValueError as error:
+            reason = f"expected a line as COLMAP writes it, got {self._line[:60]!r}"
+            raise DataError(self._path, what, reason) from error
 
     def end(self) -> None:
         """The line has to end here."""

@@ -100,10 +100,9 @@ def _poses_of_frames(
             camera_poses[image_id] = (f"rig {frame.rig_id}", pose)
             other_cameras += camera_id != images[image_id].camera_id
     if lacking := [image.name for image_id, image in images.items() if image_id not in rig_poses]:
+        reason = f"expected each image in a frame, got {len(lacking)} in none"
         advice = f"where the poses in images.* are right, remove {frames_file.name} and {rigs_file.name}"
-        raise DataError(
-            frames_file, lacking[0], f"expected each image in a frame, got {len(lacking)} in none: {advice}"
-        )
+        raise DataError(frames_file, lacking[0], f"{reason}: {advice}")
     camera_from_rig = _matrices(rigs_file, [camera_poses[image_id] for image_id in images])
     rig_from_world = _matrices(frames_file, [rig_poses[image_id] for image_id in images])
     return camera_from_rig @ rig_from_world, other_cameras

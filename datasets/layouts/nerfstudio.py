@@ -159,9 +159,8 @@ def _check_keys(source: Path, objects: Iterable[Values]) -> tuple[str, ...]:
             if key in known or _is_empty(value) or _is_harmless(key, value, values):
                 continue
             if _GEOMETRY.search(key) or key.endswith("_filenames"):
-                raise DataError(
-                    source, _field(key, values), f"cannot be used: expected none, 0 or false, got {_shown(value)}"
-                )
+                reason = f"cannot be used: expected none, 0 or false, got {_shown(value)}"
+                raise DataError(source, _field(key, values), reason)
             unused.add(key[:60])
     return (f"{source.name}: not used: {', '.join(sorted(unused)[:20])}",) if unused else ()
 
@@ -215,9 +214,8 @@ def _is_fisheye(source: Path, values: Values) -> bool:
     if flag is not None and not (isinstance(flag, int) and flag in (0, 1)):
         raise DataError(source, _field("is_fisheye", values), f"expected true or false, got {_shown(flag)}")
     if flag is not None and model and bool(flag) != (model == _FISHEYE):
-        raise DataError(
-            source, _field("is_fisheye", values), f"is {str(bool(flag)).lower()}, but camera_model is {model}"
-        )
+        reason = f"is {str(bool(flag)).lower()}, but camera_model is {model}"
+        raise DataError(source, _field("is_fisheye", values), reason)
     return bool(flag) or model == _FISHEYE
 
 

@@ -147,7 +147,7 @@ WRONG = [
     ("frames", r"\n23 3 \S+ \S+ \S+ \S+", r"\n23 3 0 0 0 0", "frame 23: expected a finite 4x4 pose"),
     ("frames", r"\n23 3 \S+", r"\n23 3 nan", "frame 23: expected a finite 4x4 pose"),
     ("frames", r"\n23 3 \S+", r"\n23 3 x", "frame: expected a line as COLMAP writes it"),
-    ("frames", " CAMERA 2 17", " LIDAR 2 17", "frame 23: expected a line as COLMAP writes it"),
+    ("frames", " CAMERA 2 17", " LIDAR 2 17", "img7.png: expected each image in a frame, got 1 in none"),
     ("frames", " CAMERA 2 17", " CAMERA 2", "frame 23: expected a line as COLMAP writes it"),
     ("frames", " CAMERA 2 17", " CAMERA 2 17 8", "1 words are left over"),
     ("frames", "2 CAMERA 1 16", "999999999 CAMERA 1 16", "frame 23"),
