@@ -141,7 +141,8 @@ def fit_folder(
                 discard_fit(work)
             raise
         folder = out
-        if stopped_by and (is_finished(out) or step_of(out) > trainer.step):
+        is_done = trainer.step >= plan.times.steps
+        if not is_done and (is_finished(out) or step_of(out) > trainer.step):
             folder = work
             kept = f"{printable(out)} keeps its {_state(out)}; this one is in {printable(work)}"
             trainer.state.note(f"{kept}, where a resumed fit goes on")
@@ -150,7 +151,7 @@ def fit_folder(
             photos = unpublished(out, "photos") if request.scene == "." else []
             publish(work, out, all_former=True, say=say, along=photos)
             for other, step in others.items():
-                if not stopped_by or step <= trainer.step:
+                if is_done or step <= trainer.step:
                     discard_fit(other)
         notes.say_new()
         if page is not None:

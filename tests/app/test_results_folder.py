@@ -398,6 +398,20 @@ def test_what_got_further_is_kept_until_one_is_further_or_done(scene: Any, tmp_p
     assert load_checkpoint(tmp_path / CHECKPOINT)["step"] == 7
 
 
+def test_results_without_a_whole_checkpoint_are_kept_until_one_is_further(
+    scene: Any, tmp_path: Path, monkeypatch: Any
+) -> None:
+    config = replace(CONFIG, steps=7)
+    for stop in (4, 2):
+        with monkeypatch.context() as patch:
+            interrupt_at(stop - 1, patch)
+            fit(scene, config, tmp_path)
+        for name in (CHECKPOINT, previous(Path(CHECKPOINT)).name):
+            (tmp_path / name).write_bytes(b"damaged")
+    assert json.loads((tmp_path / "metrics.json").read_text())["steps"] == 4
+    assert folders(tmp_path) == ["test", "unfinished-1"]
+
+
 def test_the_fit_with_these_settings_is_gone_on_with(scene: Any, tmp_path: Path, monkeypatch: Any) -> None:
     """Of several that were stopped; where none has them, the error is about the furthest."""
     for config, stop in ((CONFIG, 2), (OTHER, 1)):

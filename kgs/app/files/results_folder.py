@@ -1,5 +1,6 @@
 """The files of a fit, and which of several fits in a folder is the furthest."""
 
+from contextlib import suppress
 from pathlib import Path
 
 from kgs.errors import DataError
@@ -22,13 +23,15 @@ def is_finished(out: Path) -> bool:
 
 
 def step_of(folder: Path) -> int:
-    """The last step of the fit in a folder that its checkpoint has; -1 if there is none."""
+    """How many steps the fit in a folder did, by its results or its checkpoint; -1 if it has neither."""
     from kgs.fit.checkpoint import newest_checkpoint  # here, because it loads torch
 
-    try:
-        return int(newest_checkpoint(folder / CHECKPOINT)[0]["step"])
-    except (DataError, KeyError, TypeError, ValueError):
-        return -1
+    steps = [-1]
+    with suppress(DataError, KeyError, TypeError, ValueError):
+        steps.append(int(read_json(folder / "metrics.json")["steps"]))
+    with suppress(DataError, KeyError, TypeError, ValueError):
+        steps.append(int(newest_checkpoint(folder / CHECKPOINT)[0]["step"]))
+    return max(steps)
 
 
 def resumable_fits(out: Path) -> list[Path]:
