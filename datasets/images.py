@@ -1,6 +1,8 @@
 """Photos as arrays: removing the lens's distortion, reducing, and the intrinsics that result."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Self
 
 import cv2
@@ -11,6 +13,7 @@ from .image_file import Image
 
 Maps = tuple[Image, Image]
 _LONGEST_REMAPPED = 2**15 - 1  # a limit of OpenCV
+_LEAST_WEIGHT = 1e-6  # of a pixel that has a colour of its own
 
 
 @dataclass(frozen=True)
@@ -51,19 +54,53 @@ class Intrinsics:
         return np.array([[self.fx, 0.0, self.cx - 0.5], [0.0, self.fy, self.cy - 0.5], [0.0, 0.0, 1.0]])
 
 
-def resize(image: Image, intrinsics: Intrinsics, width: int, height: int) -> tuple[Image, Intrinsics]:
-    """Reduce an image `(H, W)` or `(H, W, K)` to means over areas, its intrinsics by the exact ratio of each axis."""
+def weighted(resample: Callable[[Image], Image], image: Image, weights: Image | None) -> Image:
+    """An image `(H, W)` or `(H, W, K)`, resampled so that pixels do not mix with those that have no weight.
+
+    Args:
+        resample: takes weighted means of pixels, as those that resize and remap do.
+        image: one whose hidden pixels may have any colour: transparent ones, or those that a mask leaves out.
+        weights: how much of each pixel is seen, `(H, W)` in [0, 1]; None: all of it.
+
+    Returns:
+        The weighted means; plain ones where nothing is seen.
+    """
+    plain = resample(image)
+    if weights is None:
+        return plain
+    total = resample(weights)
+    seen = resample(image * (weights[..., None] if image.ndim == 3 else weights))
+    if image.ndim == 3:
+        total = total[..., None]
+    return np.asarray(np.where(total > _LEAST_WEIGHT, seen / np.maximum(total, _LEAST_WEIGHT), plain), np.float32)
+
+
+def reduce(image: Image, width: int, height: int, weights: Image | None = None) -> Image:
+    """Reduce an image `(H, W)` or `(H, W, K)` to means over areas, weighted as :func:`weighted` says."""
+    if image.shape[1::-1] == (width, height):
+        return image
+    area = partial(cv2.resize, dsize=(width, height), interpolation=cv2.INTER_AREA)
+    return np.clip(weighted(area, image, weights), 0.0, 1.0).astype(np.float32)  # type: ignore[arg-type]  # OpenCV's
+
+
+def resize(
+    image: Image, intrinsics: Intrinsics, width: int, height: int, weights: Image | None = None
+) -> tuple[Image, Intrinsics]:
+    """Reduce an image as :func:`reduce` does, its intrinsics by the exact ratio of each axis."""
     if (width, height) == (intrinsics.width, intrinsics.height):
         return image, intrinsics
-    reduced = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    return np.clip(reduced, 0.0, 1.0).astype(np.float32), intrinsics.scaled(width, height)
+    return reduce(image, width, height, weights), intrinsics.scaled(width, height)
 
 
-def remap(image: Image, maps: Maps | None) -> Image:
-    """Take each pixel from the place that the maps give; without maps the image itself."""
+def remap(image: Image, maps: Maps | None, weights: Image | None = None) -> Image:
+    """Take each pixel from the place that the maps give, weighted as :func:`weighted` says; without maps the image."""
     if maps is None:
         return image
-    return np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), dtype=np.float32)
+
+    def linear(values: Image) -> Image:
+        return np.asarray(cv2.remap(values, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
+
+    return weighted(linear, image, weights)
 
 
 def rectification(intrinsics: Intrinsics) -> tuple[Intrinsics, Maps | None]:

@@ -274,7 +274,7 @@ def _views(
             if image.shape[2] == 4:
                 alpha = image[..., 3:]
                 image[..., :3] = image[..., :3] * alpha + background.numpy() * (1 - alpha)
-            image = remap(image, maps)
+            image = remap(image, maps, kept)
             kept = None if kept is None else remap(kept, maps)
         turned[i] = _is_turned(width, height, scales[0])
         if turned[i]:
@@ -286,7 +286,7 @@ def _views(
             if image is None:
                 reduced_lens = lens.scaled(width, height)
             else:
-                reduced, reduced_lens = resize(image, lens, width, height)
+                reduced, reduced_lens = resize(image, lens, width, height, kept)
                 pixels = torch.from_numpy(reduced).permute(2, 0, 1)
                 images[j][i] = pixels[:3]
                 if len(pixels) == 4:

@@ -54,3 +54,26 @@ def test_a_mask_is_upright_or_as_the_photo_is_stored(tmp_path, stored):
     (photo,) = read_photos(open_photos([tmp_path / "a.jpg"], tmp_path / "masks"), silent)
     assert photo.size == (240, 180)
     assert np.array_equal(photo.mask, mask)
+
+
+@pytest.mark.parametrize("kind", ["alpha", "mask", "both"])
+def test_a_colour_that_is_hidden_does_not_show_in_a_reduced_photo(tmp_path, kind):
+    """One colour is seen, another is hidden: at the border only the first one shows, in the photo that is written too."""
+    height, width = 1700, 1900
+    y, x = np.mgrid[:height, :width]
+    hidden = (np.hypot(x - 900, y - 850) < 501.3) | (x < 33)
+    image = np.where(hidden[..., None], np.uint8([0, 255, 0]), np.uint8([30, 60, 200]))
+    if kind != "mask":
+        image = np.dstack([image, np.where(hidden & (kind == "alpha") | (y > 1600), 0, 255).astype(np.uint8)])
+    cv2.imwrite(str(tmp_path / "a.png"), image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    if kind != "alpha":
+        (tmp_path / "masks").mkdir()
+        cv2.imwrite(str(tmp_path / "masks" / "a.png"), np.where(hidden, 0, 255).astype(np.uint8))
+    masks = None if kind == "alpha" else tmp_path / "masks"
+    (photo,) = read_photos(open_photos([tmp_path / "a.png"], masks), silent)
+    seen = np.ones(photo.pixels.shape[:2], bool) if photo.mask is None else photo.mask > 0
+    if not photo.is_opaque:
+        seen &= photo.pixels[..., 3] > 0
+        assert not photo.pixels[photo.pixels[..., 3] == 0].any()
+    assert 0.5 < seen.mean() < 0.95
+    assert np.abs(photo.pixels[seen][:, :3].astype(int) - [200, 60, 30]).max() <= 1

@@ -150,3 +150,21 @@ def test_sizes_that_can_be_scaled_versions() -> None:
     assert all(full.same_aspect(*size) for size in ((504, 378), (501, 376), (1008, 756), (4032, 3024), (253, 190)))
     assert not any(full.same_aspect(*size) for size in ((3024, 4032), (504, 370), (500, 378)))
     assert Intrinsics(200, 149, 40.0, 40.0, 100.0, 74.5).same_aspect(216, 162)  # a twelfth of 2400x1799 and 2592x1944
+
+
+@pytest.mark.parametrize("way", ["reduced", "remapped"])
+def test_colours_without_weight_do_not_show(way: str) -> None:
+    """One colour is seen, in some pixels in part, and hidden ones are noise: the mean of what is seen is that colour."""
+    rng = np.random.default_rng(0)
+    weights = blob(60.0, 45.0, 15.0)
+    weights[weights < 0.3] = 0
+    image = rng.random((HEIGHT, WIDTH, 3), np.float32)
+    image[weights > 0] = [0.2, 0.5, 0.8]
+    _, maps = rectification(lens(-0.2, 0.0, 0.0, 0.0))
+    if way == "reduced":
+        shown, left = (resize(part, lens(), 37, 29, weights)[0] for part in (image, weights))
+    else:
+        shown, left = (remap(part, maps, weights) for part in (image, weights))
+    seen = left > 0
+    assert 0 < seen.mean() < 1
+    np.testing.assert_allclose(shown[seen], np.broadcast_to([0.2, 0.5, 0.8], (int(seen.sum()), 3)), atol=1e-5)

@@ -247,3 +247,21 @@ def test_a_folder_of_masks_without_pictures_is_passed_over_unless_it_is_named(tm
     assert load_scene(tmp_path, hold_out=0).train.counted is None
     with pytest.raises(DataError, match="masks: "):
         load_scene(tmp_path, hold_out=0, masks=tmp_path / "masks")
+
+
+def test_a_colour_that_a_mask_leaves_out_does_not_show_beside_it(tmp_path: Path) -> None:
+    """Undistorted and reduced: a pixel that counts has the colour of what the mask keeps, whatever it leaves out."""
+    write_nerfstudio(tmp_path)
+    paths = sorted((tmp_path / "images").iterdir())
+    height, width = cv2.imread(str(paths[0])).shape[:2]
+    scale = 40
+    kept = np.full((height * scale, width * scale), 255, np.uint8)
+    cv2.circle(kept, (width * scale // 2, height * scale // 2), 4 * scale + 7, 0, -1)
+    for path in paths:
+        cv2.imwrite(str(path), np.where(kept[..., None] > 0, np.uint8([30, 60, 200]), np.uint8([255, 255, 255])))
+        write_mask(tmp_path / "masks" / path.with_suffix(".png").name, kept)
+    views = load_scene(tmp_path, hold_out=0, downscale=scale / 3).train
+    assert views.counted is not None
+    assert 0.3 < float(views.counted.float().mean()) < 0.95
+    seen = views.images.permute(0, 2, 3, 1)[views.counted]
+    torch.testing.assert_close(seen, torch.tensor([200.0, 60.0, 30.0]).expand_as(seen) / 255, atol=1e-5, rtol=0)

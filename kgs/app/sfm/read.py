@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kgs.datasets import folders, image_file
-from kgs.datasets.image_file import ImageFile, turn
-from kgs.datasets.images import Intrinsics
+from kgs.datasets.image_file import Image, ImageFile, turn
+from kgs.datasets.images import Intrinsics, reduce
 from kgs.datasets.masks import Mask, find_masks
 from kgs.errors import DataError
 from kgs.progress import ProgressBar
@@ -108,7 +108,8 @@ class OpenPhoto(NamedTuple):
             return False
         if _PANORAMA in self.image.load():
             return True
-        pixels = self.image.read()[..., :3]
+        pixels = self.image.read()
+        pixels = pixels[..., :3] * pixels[..., 3:] if pixels.shape[2] == 4 else pixels
         neighbours = np.abs(np.diff(pixels, axis=1)).mean((0, 2))
         seam = np.abs(pixels[:, 0] - pixels[:, -1]).mean()
         return bool(seam <= _SEAM * np.median(neighbours) + 1 / 255)
@@ -213,15 +214,13 @@ def read_photos(opened: list[OpenPhoto], bar: ProgressBar) -> list[Photo]:
     lenses = _lens_numbers(opened)
     photos = []
     for photo in bar(opened, "photos", "photo"):
-        pixels = photo.image.read()
+        pixels = np.ascontiguousarray(turn(photo.image.read(), photo.exif.orientation))
+        kept = _kept(photo)
         is_turned = lies[photo.name] != most_lie and width != height
         part = size[::-1] if is_turned else size
         whole = _larger(part, photo.size, parts[photo.name])
-        stored = whole[::-1] if photo.exif.is_sideways else whole
-        if pixels.shape[1::-1] != stored:
-            pixels = np.asarray(cv2.resize(pixels, stored, interpolation=cv2.INTER_AREA), np.float32)
-        upright = turn((pixels.clip(0, 1) * 255).round().astype(np.uint8), photo.exif.orientation)
-        mask = _mask(photo, whole)
+        upright = _reduced(pixels, whole, kept)
+        mask = None if kept is None else np.where(reduce(kept, *whole) >= 0.5, np.uint8(255), np.uint8(0))
         quarters = -1 if is_turned else 0  # clockwise
         turned = whole[::-1] if is_turned else whole
         photos.append(
@@ -266,8 +265,31 @@ def _cut(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
     return image[top : top + size[1], left : left + size[0]]
 
 
-def _mask(photo: OpenPhoto, size: tuple[int, int]) -> NDArray[np.uint8] | None:
-    """The mask of an upright photo of this size; its file is upright, too, unless its shape is that of the stored one.
+def _reduced(image: Image, size: tuple[int, int], kept: Image | None) -> NDArray[np.uint8]:
+    """An image of 8 bits with this width and height, in which no hidden colour of the given one shows.
+
+    Args:
+        image: RGB or RGBA, not premultiplied, in [0, 1].
+        size: width and height.
+        kept: the share of each pixel that a mask keeps, `(H, W)`; None: all of it.
+    """
+    if image.shape[2] == 3:
+        return _eight_bits(reduce(image, *size, kept))
+    alpha = np.ascontiguousarray(image[..., 3])
+    colors = reduce(np.ascontiguousarray(image[..., :3]), *size, alpha if kept is None else alpha * kept)
+    levels = _eight_bits(np.dstack([colors, reduce(alpha, *size, kept)]))
+    levels[levels[..., 3] == 0] = 0
+    return levels
+
+
+def _eight_bits(image: Image) -> NDArray[np.uint8]:
+    return np.asarray((image.clip(0, 1) * 255).round(), np.uint8)
+
+
+def _kept(photo: OpenPhoto) -> Image | None:
+    """The share of each pixel of the upright photo that its mask keeps, `(H, W)`; None without a mask.
+
+    The file is upright, too, unless its shape is that of the stored photo.
 
     Raises:
         DataError: it cannot be read, has another shape, or keeps nothing.
@@ -275,10 +297,10 @@ def _mask(photo: OpenPhoto, size: tuple[int, int]) -> NDArray[np.uint8] | None:
     if photo.mask is None:
         return None
     photo.mask.file.load()
-    is_upright = Intrinsics(*size, 1, 1, 0, 0).same_aspect(*photo.mask.file.size)
+    is_upright = Intrinsics(*photo.size, 1, 1, 0, 0).same_aspect(*photo.mask.file.size)
     orientation = photo.exif.orientation if photo.exif.is_sideways and not is_upright else 1
-    kept = photo.mask.read(photo.path, *(size[::-1] if orientation > 1 else size))
-    return np.ascontiguousarray(turn(np.where(kept >= 0.5, np.uint8(255), np.uint8(0)), orientation))
+    kept = photo.mask.read(photo.path, *(photo.size[::-1] if orientation > 1 else photo.size))
+    return np.ascontiguousarray(turn(kept, orientation))
 
 
 def blurred(photos: list[Photo]) -> list[Photo]:
