@@ -5,8 +5,11 @@ Pillow is silent about damaged ones, whose colours are wrong. And 16-bit integer
 8 bits.
 """
 
+import contextlib
 import io
+import struct
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -18,10 +21,10 @@ from PIL import BmpImagePlugin, JpegImagePlugin, PngImagePlugin, TiffImagePlugin
 from PIL.Image import Exif
 from PIL.ImageFile import ImageFile as Opened
 
-from kgs.errors import DataError
+from kgs.errors import DataError, listed
 
 from . import folders
-from .color_profile import to_srgb
+from .color_profile import ADOBE_RGB, Colors, Profile, cmyk_to_rgb, colors_of, is_usable, to_srgb
 
 Image = NDArray[np.float32]
 _PLUGINS: dict[str, type[Opened]] = {
@@ -42,6 +45,7 @@ _KINDS = {
 _HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 _LONGEST_SIGNATURE = 12  # bytes
 _PNG_BITS = 24  # the byte of a PNG that has the bits of a sample
+_LISTED = 10
 _TO_RGB = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}
 # Tags of TIFF and Exif
 _BITS = 258
@@ -51,10 +55,20 @@ _SAMPLES = 277
 _TILE_WIDTH = 322
 _TILE_HEIGHT = 323
 _EXTRA_SAMPLES = 338
+_WHITE = 318
+_PRIMARIES = 319
 _EXIF = 34665
+_COLOR_SPACE = 40961
+_INTEROPERABILITY = 40965
+_GAMMA = 42240
 _LAB = {8: "CIELab", 9: "ICCLab", 10: "ITULab"}  # values of `_COLORS` that are decoded wrongly
 _MULTIPLIED_ALPHA = 1  # a value of `_EXTRA_SAMPLES`
 _ALPHA = 2  # likewise
+_WHITE_IS_ZERO = 0  # a value of `_COLORS`
+_CMYK = 5  # likewise
+_IS_SRGB = 1  # a value of `_COLOR_SPACE`
+_IS_ADOBE_RGB = 2  # likewise, of some cameras
+_IS_OTHER = 65535  # likewise
 
 
 class Metadata(NamedTuple):
@@ -62,7 +76,7 @@ class Metadata(NamedTuple):
 
     size: tuple[int, int]  # width and height of the stored pixels
     tags: dict[int, Any]  # of the image and its Exif directory, as Pillow gives them; empty if damaged
-    profile: bytes = b""  # ICC; empty if there is none
+    profile: Profile = b""  # of its colours; empty if nothing is said
 
 
 class ImageFile:
@@ -111,7 +125,7 @@ class ImageFile:
         kind = _kind(self.path, data[:_LONGEST_SIGNATURE])
         metadata = self.metadata  # the size is checked before anything is decoded
         try:
-            pixels = _decode(kind, data)
+            pixels = _decode(kind, data, metadata.profile)
         except ValueError as error:
             raise DataError(self.path, "", str(error)) from error
         height, width = pixels.shape[:2]
@@ -119,6 +133,24 @@ class ImageFile:
             raise DataError(self.path, "", f"expected {metadata.size} pixels as its header says, got {(width, height)}")
         self._data = None
         return to_srgb(pixels, metadata.profile)
+
+    @property
+    def doubt(self) -> str:
+        """Why its colours may be others than sRGB, which they are taken for; "" where all is well."""
+        if not is_usable(self.metadata.profile):
+            return "the colour profile is damaged or of another kind"
+        if not self.metadata.profile and self.metadata.tags.get(_COLOR_SPACE) == _IS_OTHER:
+            return "the Exif says that they are not, and not what they are"
+        return ""
+
+
+def color_notes(images: Sequence[ImageFile]) -> list[str]:
+    """A sentence for each reason to doubt that colours of photos are sRGB."""
+    doubted: dict[str, list[str]] = {}
+    for image in images:
+        if image.doubt:
+            doubted.setdefault(image.doubt, []).append(image.path.name)
+    return [f"colours are taken for sRGB, but {doubt}: {listed(names, _LISTED)}" for doubt, names in doubted.items()]
 
 
 def read_image(path: Path) -> Image:
@@ -171,6 +203,8 @@ def _read_header(path: Path, file: IO[bytes], length: int) -> Metadata:
     try:
         with warnings.catch_warnings(action="ignore"):  # Pillow warns of damaged metadata
             image = _open(kind, file)
+            chunks = _png_chunks(file) if kind == "PNG" else {}
+            image.info |= {"exif": chunks[b"eXIf"]} if b"eXIf" in chunks else {}
             tags = _tags(image)
         if kind == "HEIC":
             tags[_ORIENTATION] = _left_to_turn(image, file)
@@ -185,7 +219,11 @@ def _read_header(path: Path, file: IO[bytes], length: int) -> Metadata:
         raise DataError(path, "", f"cannot be decoded: damaged, cut short, or an unusual {kind} ({error})") from error
     check_size(path, *size, length)
     check_size(path, *tile, length)  # tiles are decoded whole
-    return Metadata(size, tags, image.info.get("icc_profile") or b"")
+    try:
+        profile = _profile(kind, image, file, chunks, tags)
+    except ValueError as error:
+        raise DataError(path, "", str(error)) from error
+    return Metadata(size, tags, profile)
 
 
 def _open(kind: str, file: IO[bytes]) -> Opened:
@@ -211,9 +249,64 @@ def _tags(image: Opened) -> dict[int, Any]:
             exif = image.getexif()
         else:
             return {}
-        return dict(exif) | exif.get_ifd(_EXIF)
+        tags = dict(exif) | exif.get_ifd(_EXIF)
+        with contextlib.suppress(Exception):
+            tags[_INTEROPERABILITY] = exif.get_ifd(_INTEROPERABILITY).get(1)
+        return tags
     except Exception:  # Pillow has no error of its own for damage
         return {}
+
+
+def _png_chunks(file: IO[bytes]) -> dict[bytes, bytes]:
+    """What Pillow does not read of a PNG: cICP, and an eXIf that comes behind the pixels."""
+    found = dict[bytes, bytes]()
+    file.seek(8)
+    while len(head := file.read(8)) == 8:
+        length, kind = struct.unpack(">I4s", head)
+        if kind in (b"cICP", b"eXIf"):
+            found[kind] = file.read(length)
+            length = 0
+        file.seek(length + 4, io.SEEK_CUR)  # the check sum
+    return found
+
+
+def _profile(kind: str, image: Opened, file: IO[bytes], chunks: dict[bytes, bytes], tags: dict[int, Any]) -> Profile:
+    """What a file says of its colours, what counts more first; a ValueError where they cannot be converted."""
+    icc: bytes = image.info.get("icc_profile") or (_bmp_profile(file) if kind == "BMP" else b"")
+    if kind == "PNG" and len(cicp := chunks.get(b"cICP", b"")) == 4:
+        primaries, curve, matrix, full = cicp
+        if (matrix, full) != (0, 1):
+            raise ValueError(f"expected RGB of the full range, got matrix {matrix} and range {full} in its cICP chunk")
+        return colors_of(primaries, curve)
+    if icc:
+        return icc
+    if kind == "PNG" and "srgb" in image.info:
+        return Colors()
+    if kind == "PNG" and ("gamma" in image.info or "chromaticity" in image.info):
+        places = image.info.get("chromaticity") or (*Colors().white, *sum(Colors().primaries, ()))
+        exponent = image.info.get("gamma")
+        return Colors.of(places, 1 / exponent if exponent else None) or b""
+    if nclx := image.info.get("nclx_profile"):
+        return colors_of(nclx["color_primaries"], nclx["transfer_characteristics"])
+    space = tags.get(_COLOR_SPACE)
+    if space == _IS_SRGB:
+        return Colors()
+    if space == _IS_ADOBE_RGB or str(tags.get(_INTEROPERABILITY)).startswith("R03"):
+        return ADOBE_RGB
+    if _WHITE in tags and _PRIMARIES in tags:
+        return Colors.of((*tags[_WHITE], *tags[_PRIMARIES]), tags.get(_GAMMA)) or b""
+    return b""
+
+
+def _bmp_profile(file: IO[bytes]) -> bytes:
+    """The ICC profile in a BMP of version 5, b"" if there is none."""
+    file.seek(14)
+    head = file.read(124)
+    if len(head) < 124 or head[56:60] != b"DEBM" or head[:4] != struct.pack("<I", 124):
+        return b""
+    start, length = struct.unpack_from("<II", head, 112)
+    file.seek(14 + start)
+    return file.read(length)
 
 
 def _left_to_turn(image: Opened, file: IO[bytes]) -> int:
@@ -239,18 +332,26 @@ def check_size(path: Path, width: int, height: int, size: int) -> None:
         raise DataError(path, "header", f"claims {width}x{height} pixels in {size} bytes: a decompression bomb")
 
 
-def _decode(kind: str, data: bytes) -> Image:
+def _decode(kind: str, data: bytes, profile: Profile) -> Image:
     """RGB or RGBA in [0, 1] of an image's bytes, whose size was checked; a ValueError where it cannot be decoded."""
     try:
         if kind == "JPEG":
             return _to_float(_decode_jpeg(data))
         if kind == "TIFF":
-            return _decode_tiff(data)
+            return _decode_tiff(data, profile)
+        image = _open(kind, io.BytesIO(data))
         if kind == "PNG":
             _open(kind, io.BytesIO(data)).verify()  # the check sums, which decoders pass over
+            clear = image.info.get("transparency")
+            is_one_grey = isinstance(clear, int) and image.mode != "P"
             if data[_PNG_BITS] == 16:
-                return _to_float(_decode_with_opencv(data))
-        return _to_float(_decode_with_pillow(_open(kind, io.BytesIO(data))))
+                pixels = _decode_with_opencv(data)
+                if is_one_grey:  # OpenCV passes it over
+                    pixels = np.dstack([pixels, np.where(pixels[..., 0] == clear, 0, 65535).astype(np.uint16)])
+                return _to_float(pixels)
+            if is_one_grey and image.mode == "L":  # Pillow spreads 2 and 4 bits over 8, but not this number
+                image.info["transparency"] = clear * (255 // (2 ** data[_PNG_BITS] - 1))
+        return _to_float(_decode_with_pillow(image))
     except (ValueError, MemoryError):
         raise
     except Exception as error:  # neither Pillow, kornia_rs nor OpenCV has one class of errors for damage
@@ -265,6 +366,8 @@ def _to_float(pixels: NDArray[np.uint8 | np.uint16]) -> Image:
 def _decode_with_pillow(image: Opened) -> NDArray[np.uint8]:
     """RGB or RGBA of an image of 8 bits or less, upright if it is a TIFF or HEIC."""
     with warnings.catch_warnings(action="ignore"):  # Pillow warns of many pixels: the size was checked
+        if image.mode == "La":  # which Pillow converts to nothing that has colours
+            return np.asarray(image)[..., [0, 0, 0, 1]]
         return np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB"))
 
 
@@ -283,6 +386,8 @@ def _decode_jpeg(data: bytes) -> NDArray[np.uint8]:
     """RGB of a JPEG. What lies behind its end, such as a phone's video, is ignored."""
     file = io.BytesIO(data)
     image = _open("JPEG", file)
+    if image.mode == "CMYK":
+        raise ValueError("expected a JPEG of grey or RGB, got CMYK: convert it to RGB")
     end = file.tell()  # of the header of the first scan
     # Only progressive images use its last three bytes. In others some phones leave them 0, and decoders warn of it.
     if "progressive" not in image.info and data[end - 3 : end] == b"\0\0\0":
@@ -290,7 +395,7 @@ def _decode_jpeg(data: bytes) -> NDArray[np.uint8]:
     return np.asarray(kornia_io.decode_image_jpegturbo(data, "rgb"))
 
 
-def _decode_tiff(data: bytes) -> Image:
+def _decode_tiff(data: bytes, profile: Profile) -> Image:
     """RGB or RGBA in [0, 1] of a TIFF, as stored, its colours not multiplied by alpha."""
     image = _open("TIFF", io.BytesIO(data))
     tags = image.tag_v2  # type: ignore[attr-defined]  # of TIFF only
@@ -299,12 +404,17 @@ def _decode_tiff(data: bytes) -> Image:
     orientation = int(tags.get(_ORIENTATION, 1))
     samples = int(tags.get(_SAMPLES, 1))
     alpha = tags.get(_EXTRA_SAMPLES, (0,))[0]
+    bits = max(tags.get(_BITS, (1,)))
     # Pillow leaves out a fourth sample of unspecified meaning and rounds when it divides colours by alpha.
-    if max(tags.get(_BITS, (1,))) <= 8 and (samples != 4 or alpha == _ALPHA):
+    if tags.get(_COLORS) == _CMYK and bits <= 8 and samples == 4:
+        pixels = _to_float(np.asarray(cmyk_to_rgb(image, profile if isinstance(profile, bytes) else b"")))
+    elif bits <= 8 and (samples != 4 or alpha == _ALPHA):
         pixels = _to_float(_decode_with_pillow(image))
     else:
         pixels = _to_float(_decode_with_opencv(data))
-    if samples == 4 and alpha == _MULTIPLIED_ALPHA:
+        if tags.get(_COLORS) == _WHITE_IS_ZERO:  # which OpenCV passes over
+            pixels[..., :3] = 1 - pixels[..., :3]
+    if samples in (2, 4) and alpha == _MULTIPLIED_ALPHA:
         pixels[..., :3] = np.minimum(pixels[..., :3] / np.maximum(pixels[..., 3:], 1 / 65535), 1)
     # Both decoders turned the image upright: turn it back. 6 and 8 undo each other, all others undo themselves.
     return np.ascontiguousarray(turn(pixels, {6: 8, 8: 6}.get(orientation, orientation)))

@@ -20,6 +20,7 @@ from kgs.errors import DataError, listed
 from .border import with_border
 from .folders import CAMERAS_REPORT
 from .frames import LARGEST, Frame, FrameSet
+from .image_file import color_notes
 from .images import rectification, remap, resize
 from .layouts import find_layout
 from .masks import find_masks, mask_folder
@@ -58,7 +59,7 @@ def load_scene(
     and so on or `sparse` (COLMAP), `transforms_train.json` (Blender), `transforms.json` (nerfstudio, instant-ngp), a
     COLMAP model beside its photos or their folder `images`. Of several COLMAP models the one with most images is read.
     What the files say is used, refused, or, if it cannot change an image, named in `Scene.notes`; so are photos that a
-    COLMAP model has and the folder lacks. Colours are converted to sRGB where a photo has another colour profile.
+    COLMAP model has and the folder lacks. Colours are converted to sRGB where a photo's file says that they are others.
 
     Convention:
         Kornia's in the result, see `Views`: world-to-camera extrinsics with OpenCV axes, integer pixel centres. The
@@ -124,7 +125,8 @@ def load_scene(
         train_per_scale = [with_border(views) for views in make_views(train, scales)]
         at_size = train_per_scale[0]
         (test_views,) = make_views(test, scales[:1])
-        notes = (*frame_set.notes, *_mask_notes([*train, *test], at_size, absent))
+        colors = color_notes([frame.image for frame in (*train, *test)])
+        notes = (*frame_set.notes, *_mask_notes([*train, *test], at_size, absent), *colors)
         if at_size.transmittance is not None:
             notes += (_BORDER,)
         return Scene(

@@ -58,7 +58,7 @@ def test_a_mask_is_upright_or_as_the_photo_is_stored(tmp_path, stored):
 
 @pytest.mark.parametrize("kind", ["alpha", "mask", "both"])
 def test_a_colour_that_is_hidden_does_not_show_in_a_reduced_photo(tmp_path, kind):
-    """One colour is seen, another is hidden: at the border only the first one shows, in the photo that is written too."""
+    """One colour is seen, another is hidden: at the border only the first one shows."""
     height, width = 1700, 1900
     y, x = np.mgrid[:height, :width]
     hidden = (np.hypot(x - 900, y - 850) < 501.3) | (x < 33)

@@ -1,4 +1,4 @@
-"""Photos with a colour profile, as phones and editors write them, come out in sRGB."""
+"""Photos whose files say that their colours are others than sRGB, in any way, come out in sRGB."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ import numpy as np
 import PIL.Image
 import pytest
 from PIL import ImageCms
-from tiny_scenes import png_chunk
+from tiny_scenes import png_chunk, write_colmap
 
 from kgs.app.sfm.read import open_photos, read_photos
-from kgs.datasets.image_file import read_image
+from kgs.datasets import load_scene
+from kgs.datasets.image_file import ImageFile, color_notes, read_image
+from kgs.errors import DataError
 from kgs.progress import silent
 
 # The primaries of Display P3 adapted to D50 (SMPTE EG 432-1, Bradford), and their linear light in that of sRGB.
@@ -23,33 +25,62 @@ P3_TO_SRGB = np.array([[1.2249402, -0.2249402, 0.0], [-0.0420569, 1.0420569, 0.0
 SRGB_CURVE = (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)
 
 
+# Linear light in that of sRGB, from the numbers of Adobe RGB (1998), and from ITU-R BT.2087.
+ADOBE_TO_SRGB = np.array([[1.3983557, -0.3983557, 0.0], [0.0, 1.0, 0.0], [0.0, -0.0429290, 1.0429290]])
+BT2020_TO_SRGB = np.array([[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]])
+D65 = (31270, 32900)
+
+
 def fixed(*values: float) -> bytes:
     return struct.pack(f">{len(values)}i", *(round(value * 65536) for value in values))
 
 
-def p3_profile() -> bytes:
-    """A profile of Display P3, written from the description of the format (ICC.1:2022)."""
-    curve = b"para" + struct.pack(">IHH", 0, 3, 0) + fixed(*SRGB_CURVE)
+def icc(space: bytes, more: dict[bytes, bytes], kind: bytes = b"mntr", connection: bytes = b"XYZ ") -> bytes:
+    """A profile with these tags, written from the description of the format (ICC.1:2022)."""
     text = b"mluc" + struct.pack(">III2s2sII", 0, 1, 12, b"en", b"US", 4, 28) + "P3".encode("utf-16-be")
-    tags = {b"desc": text, b"cprt": text, b"wtpt": b"XYZ " + bytes(4) + fixed(0.9642, 1.0, 0.8249)}
-    for name, colorant in zip((b"r", b"g", b"b"), P3_COLORANTS, strict=True):
-        tags[name + b"XYZ"] = b"XYZ " + bytes(4) + fixed(*colorant)
-        tags[name + b"TRC"] = curve
+    tags = {b"desc": text, b"cprt": text, b"wtpt": b"XYZ " + bytes(4) + fixed(0.9642, 1.0, 0.8249)} | more
     table, body = struct.pack(">I", len(tags)), b""
     for name, content in tags.items():
         table += name + struct.pack(">II", 128 + 4 + 12 * len(tags) + len(body), len(content))
         body += content + bytes(-len(content) % 4)
-    head = struct.pack(">I4sI4s4s4s", 132 + len(table) - 4 + len(body), b"lcms", 0x04000000, b"mntr", b"RGB ", b"XYZ ")
+    head = struct.pack(">I4sI4s4s4s", 132 + len(table) - 4 + len(body), b"lcms", 0x04000000, kind, space, connection)
     head += struct.pack(">6H4s", 2026, 1, 1, 0, 0, 0, b"acsp") + bytes(28) + fixed(0.9642, 1.0, 0.8249)
     return head.ljust(128, b"\0") + table + body
 
 
-def srgb_of_p3(levels: np.ndarray) -> np.ndarray:
-    """The closed form: both spaces have one curve and one white, and differ by a matrix."""
+def p3_profile() -> bytes:
+    curve = b"para" + struct.pack(">IHH", 0, 3, 0) + fixed(*SRGB_CURVE)
+    tags = {}
+    for name, colorant in zip((b"r", b"g", b"b"), P3_COLORANTS, strict=True):
+        tags[name + b"XYZ"] = b"XYZ " + bytes(4) + fixed(*colorant)
+        tags[name + b"TRC"] = curve
+    return icc(b"RGB ", tags)
+
+
+def grey_profile(gamma: float) -> bytes:
+    return icc(b"GRAY", {b"kTRC": b"para" + struct.pack(">IHH", 0, 0, 0) + fixed(gamma)})
+
+
+def cmyk_profile() -> bytes:
+    """Of three inks that are not to be seen, and a black one."""
+    steps = bytes(range(256))
+    grid = b"".join(bytes([0 if corner % 2 else 255, 128, 128]) for corner in range(16))  # Lab; black changes fastest
+    head = b"mft1" + bytes(4) + bytes([4, 3, 2, 0]) + fixed(1, 0, 0, 0, 1, 0, 0, 0, 1)
+    return icc(b"CMYK", {b"A2B0": head + 4 * steps + grid + 3 * steps}, b"prtr", b"Lab ")
+
+
+def to_srgb(levels: np.ndarray, matrix: np.ndarray | None, gamma: float | None = None) -> np.ndarray:
+    """The closed form: light by a curve (sRGB's without `gamma`), turned by a matrix, in sRGB's curve."""
     values = levels / 255
-    linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
-    moved = np.clip(linear @ P3_TO_SRGB.T, 0, 1)
+    light = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+    light = light if gamma is None else values**gamma
+    moved = np.clip(light if matrix is None else light @ matrix.T, 0, 1)
     return 255 * np.where(moved <= 0.0031308, moved * 12.92, 1.055 * moved ** (1 / 2.4) - 0.055)
+
+
+def srgb_of_p3(levels: np.ndarray) -> np.ndarray:
+    """Both spaces have one curve and one white, and differ by a matrix."""
+    return to_srgb(levels, P3_TO_SRGB)
 
 
 def patches() -> np.ndarray:
@@ -88,6 +119,183 @@ def test_unposed_photos_are_converted(tmp_path: Path) -> None:
     paths = [save(tmp_path / f"{i}.png", p3_profile(), np.roll(patches(), 16 * i, axis=0)) for i in range(3)]
     for i, photo in enumerate(read_photos(open_photos(paths), silent)):
         np.testing.assert_allclose(photo.pixels, srgb_of_p3(np.roll(patches(), 16 * i, axis=0)), atol=1.5)
+
+
+def exif(space: int | None, index: str = "", more: dict[int, object] | None = None) -> PIL.Image.Exif:
+    """Exif that says of the colours: the number of their space, the index of interoperability, other tags."""
+    block = PIL.Image.Exif()
+    inner: dict[int, object] = {} if space is None else {0xA001: space}
+    block[0x8769] = inner | ({0xA005: {1: index}} if index else {})
+    for tag, value in (more or {}).items():
+        block[tag] = value
+    return block
+
+
+def write(path: Path, levels: np.ndarray, block: PIL.Image.Exif) -> Path:
+    options = {"quality": 100, "subsampling": 0} if path.suffix == ".jpg" else {"lossless": True}
+    if path.suffix == ".tif":  # Pillow cannot write these directories into one
+        data = PIL.Image.fromarray(levels)
+        data.save(path)
+        body = path.read_bytes()
+        inner = struct.unpack_from("<I", body, 4)[0]
+        count = struct.unpack_from("<H", body, inner)[0]
+        entries = body[inner + 2 : inner + 2 + 12 * count]
+        start = len(body) + len(body) % 2
+        size = 2 + 12 * (count + 1) + 4
+        new = struct.pack("<H", count + 1) + entries + struct.pack("<HHII", 0x8769, 4, 1, start + size) + bytes(4)
+        new += struct.pack("<H", 2) + struct.pack("<HHII", 0xA001, 3, 1, 65535)
+        new += struct.pack("<HHII", 0xA005, 4, 1, start + size + 30) + bytes(4)
+        new += struct.pack("<H", 1) + struct.pack("<HHI4s", 1, 2, 4, b"R03\0") + bytes(4)
+        path.write_bytes(body[:4] + struct.pack("<I", start) + body[8:].ljust(start - 8, b"\0") + new)
+        return path
+    PIL.Image.fromarray(levels).save(path, exif=block, **options)
+    return path
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tif"])
+def test_adobe_rgb_that_exif_alone_says_becomes_srgb(tmp_path: Path, suffix: str) -> None:
+    """As cameras write it: the space is "uncalibrated", and the index of interoperability says which one that is."""
+    path = write(tmp_path / f"a.{suffix}", patches(), exif(65535, "R03"))
+    stored = cv2.imread(str(path))[..., ::-1]
+    expected = to_srgb(stored, ADOBE_TO_SRGB, 563 / 256)
+    assert np.abs(expected - stored).max() > 50
+    np.testing.assert_allclose(read_image(path) * 255, expected, atol=0.1)
+    (photo,) = read_photos(open_photos([path]), silent)
+    np.testing.assert_allclose(photo.pixels, expected, atol=0.7)
+
+
+P3_PLACES = {318: (0.3127, 0.329), 319: (0.68, 0.32, 0.265, 0.69, 0.15, 0.06)}
+
+
+@pytest.mark.parametrize(
+    ("block", "matrix", "gamma", "doubted"),
+    [
+        (exif(1, "R98"), None, None, False),
+        (exif(1, "R03"), None, None, False),
+        (exif(2), ADOBE_TO_SRGB, 563 / 256, False),
+        (exif(None, "R03"), ADOBE_TO_SRGB, 563 / 256, False),
+        (exif(65535, more=P3_PLACES), P3_TO_SRGB, None, False),
+        (exif(65535, more={318: (0.0, 0.0), 319: (0.1,) * 6}), None, None, True),
+        (exif(65535), None, None, True),
+        (exif(None), None, None, False),
+    ],
+    ids=["sRGB", "sRGB that has both", "2", "index alone", "primaries", "wrong primaries", "uncalibrated", "nothing"],
+)
+def test_what_exif_says_of_colours(
+    tmp_path: Path, block: PIL.Image.Exif, matrix: np.ndarray | None, gamma: float | None, doubted: bool
+) -> None:
+    path = write(tmp_path / "a.png", patches(), block)
+    expected = patches() if matrix is None else to_srgb(patches(), matrix, gamma)
+    np.testing.assert_allclose(read_image(path) * 255, expected, atol=0.1)
+    notes = color_notes([ImageFile(path)])
+    assert len(notes) == doubted
+    assert all("a.png" in note and "sRGB" in note for note in notes)
+
+
+def with_chunks(levels: np.ndarray, *chunks: tuple[bytes, bytes], behind: bool = False) -> bytes:
+    data = cv2.imencode(".png", levels[..., ::-1])[1].tobytes()
+    at = len(data) - 12 if behind else 33
+    return data[:at] + b"".join(png_chunk(*chunk) for chunk in chunks) + data[at:]
+
+
+def gamma_chunk(value: float) -> tuple[bytes, bytes]:
+    return b"gAMA", struct.pack(">I", round(value * 100_000))
+
+
+def places_chunk(*places: int) -> tuple[bytes, bytes]:
+    return b"cHRM", struct.pack(">8I", *D65, *places)
+
+
+SRGB_PLACES = places_chunk(64000, 33000, 30000, 60000, 15000, 6000)
+ADOBE_PLACES = places_chunk(64000, 33000, 21000, 71000, 15000, 6000)
+P3_CHUNK = (b"iCCP", b"P3\0\0" + zlib.compress(p3_profile()))
+CHUNKS = {
+    "gamma of sRGB": ([gamma_chunk(0.45455)], None, None),
+    "gamma and primaries of sRGB": ([gamma_chunk(0.45455), SRGB_PLACES], None, None),
+    "linear": ([gamma_chunk(1.0)], None, 1.0),
+    "another gamma": ([gamma_chunk(1 / 1.8)], None, 1.8),
+    "Adobe RGB": ([gamma_chunk(256 / 563), ADOBE_PLACES], ADOBE_TO_SRGB, 563 / 256),
+    "primaries alone": ([places_chunk(68000, 32000, 26500, 69000, 15000, 6000)], P3_TO_SRGB, None),
+    "sRGB before gamma": ([(b"sRGB", b"\0"), gamma_chunk(1.0), ADOBE_PLACES], None, None),
+    "profile before gamma": ([P3_CHUNK, gamma_chunk(1.0)], P3_TO_SRGB, None),
+    "cICP of P3": ([(b"cICP", bytes([12, 13, 0, 1]))], P3_TO_SRGB, None),
+    "cICP of BT.2020": ([(b"cICP", bytes([9, 13, 0, 1]))], BT2020_TO_SRGB, None),
+    "cICP of linear light": ([(b"cICP", bytes([1, 8, 0, 1]))], None, 1.0),
+    "cICP before a profile": ([(b"cICP", bytes([1, 13, 0, 1])), P3_CHUNK], None, None),
+    "damaged": ([gamma_chunk(0), (b"cHRM", bytes(32))], None, None),
+}
+
+
+@pytest.mark.parametrize("kind", CHUNKS)
+def test_what_a_png_says_of_colours(tmp_path: Path, kind: str) -> None:
+    chunks, matrix, gamma = CHUNKS[kind]
+    expected = patches() if matrix is None and gamma is None else to_srgb(patches(), matrix, gamma)
+    (tmp_path / "a.png").write_bytes(with_chunks(patches(), *chunks))
+    np.testing.assert_allclose(read_image(tmp_path / "a.png") * 255, expected, atol=1.5 if "profile" in kind else 0.2)
+
+
+def test_exif_behind_the_pixels_of_a_png(tmp_path: Path) -> None:
+    block = exif(65535, "R03").tobytes()
+    (tmp_path / "a.png").write_bytes(with_chunks(patches(), (b"eXIf", block.removeprefix(b"Exif\0\0")), behind=True))
+    expected = to_srgb(patches(), ADOBE_TO_SRGB, 563 / 256)
+    np.testing.assert_allclose(read_image(tmp_path / "a.png") * 255, expected, atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("cicp", "said"),
+    [
+        ((9, 16, 0, 1), "HDR .PQ."),
+        ((9, 18, 0, 1), "HDR .HLG."),
+        ((99, 13, 0, 1), "known colours"),
+        ((1, 13, 0, 0), "full"),
+    ],
+)
+def test_colours_that_cannot_be_converted_are_refused(tmp_path: Path, cicp: tuple[int, ...], said: str) -> None:
+    (tmp_path / "a.png").write_bytes(with_chunks(patches(), (b"cICP", bytes(cicp))))
+    with pytest.raises(DataError, match=rf"a\.png: expected .*{said}"):
+        read_image(tmp_path / "a.png")
+
+
+def test_a_profile_of_grey(tmp_path: Path) -> None:
+    levels = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    for name in ("a.png", "a.jpg", "a.tif"):
+        path = save(tmp_path / name, grey_profile(1.8), levels)
+        stored = cv2.imread(str(path))
+        np.testing.assert_allclose(read_image(path) * 255, to_srgb(stored, None, 1.8), atol=1.5)
+
+
+def test_a_profile_of_cmyk(tmp_path: Path) -> None:
+    inks = np.zeros((16, 16, 4), np.uint8)
+    inks[:, :8, 0] = 255  # a cyan that is not to be seen
+    inks[8:, :, 3] = 255
+    image = PIL.Image.fromarray(inks, "CMYK")
+    image.save(tmp_path / "a.tif", icc_profile=cmyk_profile())
+    expected = np.where(np.arange(16)[:, None, None] < 8, 1.0, 0.0) * np.ones((16, 16, 3))
+    np.testing.assert_allclose(read_image(tmp_path / "a.tif"), expected, atol=2 / 255)
+    image.save(tmp_path / "a.jpg", icc_profile=cmyk_profile())
+    with pytest.raises(DataError, match=r"a\.jpg: expected a JPEG of grey or RGB, got CMYK"):
+        read_image(tmp_path / "a.jpg")
+
+
+def test_a_profile_in_a_bmp(tmp_path: Path) -> None:
+    levels = patches()
+    head = struct.pack("<IiiHHIIiiII", 124, 128, -128, 1, 24, 0, 0, 2835, 2835, 0, 0) + bytes(16) + b"DEBM" + bytes(48)
+    profile = p3_profile()
+    pixels = levels[..., ::-1].tobytes()
+    head += struct.pack("<IIII", 0, 124 + len(pixels), len(profile), 0)
+    (tmp_path / "a.bmp").write_bytes(
+        struct.pack("<2sIHHI", b"BM", 138 + len(pixels) + len(profile), 0, 0, 138) + head + pixels + profile
+    )
+    np.testing.assert_allclose(read_image(tmp_path / "a.bmp") * 255, srgb_of_p3(levels), atol=1.5)
+
+
+def test_both_readers_say_what_they_doubt(tmp_path: Path) -> None:
+    write_colmap(tmp_path)
+    photo = next((tmp_path / "images").iterdir())
+    PIL.Image.open(photo).save(photo, exif=exif(65535))
+    notes = [note for note in load_scene(tmp_path, hold_out=0).notes if "sRGB" in note]
+    assert len(notes) == 1
+    assert photo.name in notes[0]
 
 
 @pytest.mark.parametrize("kind", ["none", "sRGB", "damaged", "grey"])

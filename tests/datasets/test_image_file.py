@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from tiny_scenes import plain_png, png_of
+from tiny_scenes import plain_png, png_chunk, png_of
 
 from kgs.datasets.image_file import read_image, read_size
 from kgs.errors import DataError
@@ -167,9 +167,36 @@ def test_tiffs_of_lab_are_refused_and_those_of_cmyk_read(tmp_path: Path) -> None
     np.testing.assert_array_equal(read_image(path)[..., :3] * 255, np.broadcast_to([200, 60, 30], (5, 7, 3)))
 
 
+def test_a_tiff_in_which_white_is_zero(tmp_path: Path) -> None:
+    for kind in (np.uint8, np.uint16):
+        grey = pixels(kind, 1)
+        data = tiff(grey).replace(struct.pack("<HHIHH", 262, 3, 1, 1, 0), struct.pack("<HHIHH", 262, 3, 1, 0, 0))
+        image = read_image(stored(tmp_path / "a.tif", data))
+        np.testing.assert_allclose(image, 1 - (grey / np.iinfo(kind).max).repeat(3, axis=2), atol=1e-6)
+
+
+@pytest.mark.parametrize("bits", [1, 2, 4, 8, 16])
+def test_the_grey_that_a_png_makes_transparent(tmp_path: Path, bits: int) -> None:
+    most = 2**bits - 1
+    clear = most // 3 if bits > 1 else 1
+    values = [clear, most - clear]
+    row = int("".join(f"{value:0{bits}b}" for value in values).ljust(8, "0"), 2)
+    rows = (b"\0" + row.to_bytes(max(1, bits // 4), "big")) * 2
+    chunk = png_chunk(b"tRNS", struct.pack(">H", clear))
+    data = png_of(zlib.compress(rows), 2, 2)
+    head = png_chunk(b"IHDR", struct.pack(">IIBBBBB", 2, 2, bits, 0, 0, 0, 0))
+    image = read_image(stored(tmp_path / "a.png", data[:8] + head + chunk + data[33:]))
+    assert image.shape == (2, 2, 4)
+    np.testing.assert_allclose(image[..., 0], np.broadcast_to(np.array(values) / most, (2, 2)), atol=1e-6)
+    np.testing.assert_array_equal(image[..., 3], [[0, 1]] * 2)
+
+
 def test_alpha_of_grey_images_is_used_or_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="unusual TIFF"):
         read_image(stored(tmp_path / "a.tif", tiff(pixels(np.uint16, 2))))
+    multiplied = np.broadcast_to(np.array([40, 51], np.uint8), (5, 7, 2))
+    image = read_image(stored(tmp_path / "a.tif", tiff(multiplied, alpha=1)))
+    np.testing.assert_allclose(image * 255, np.broadcast_to([200, 200, 200, 51], (5, 7, 4)), atol=1e-3)
     grey = pixels(np.uint8, 2)
     image = read_image(stored(tmp_path / "a.tif", tiff(grey)))
     np.testing.assert_array_equal(image, grey[..., [0, 0, 0, 1]] / np.float32(255))

@@ -154,7 +154,7 @@ def test_sizes_that_can_be_scaled_versions() -> None:
 
 @pytest.mark.parametrize("way", ["reduced", "remapped"])
 def test_colours_without_weight_do_not_show(way: str) -> None:
-    """One colour is seen, in some pixels in part, and hidden ones are noise: the mean of what is seen is that colour."""
+    """One colour is seen, in some pixels in part, and hidden ones are noise: the means are that colour."""
     rng = np.random.default_rng(0)
     weights = blob(60.0, 45.0, 15.0)
     weights[weights < 0.3] = 0

@@ -19,6 +19,7 @@ from kgs.app.files.locks import locked
 from kgs.app.files.outputs import png_names
 from kgs.app.files.publishing import begin, complete, discard, publish, replacing, unpublished
 from kgs.app.files.results_folder import resumable_fits
+from kgs.datasets.image_file import color_notes
 from kgs.datasets.masks import mask_folder
 from kgs.errors import DataError
 from kgs.json_files import read_json, write_json
@@ -167,6 +168,8 @@ def find_cameras(
         for photo in photos:
             if photo.whole:
                 say(f"{photo.name}: only its middle is taken, because it has another shape than most photos")
+        for note in color_notes([photo.image for photo in opened]):
+            say(note)
         unsharp = [photo.name for photo in blurred(photos)]
         if unsharp:
             say(f"blurred beside the others: {', '.join(unsharp)}; if the fit shows it, take them again")
