@@ -4,16 +4,32 @@ Loads neither NumPy nor torch, so that the command reports a wrong folder at onc
 """
 
 import os
+import re
+from collections.abc import Iterable, Sequence
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
 from kgs.errors import DataError
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+_JPEG = (".jpg", ".jpeg", ".jpe", ".jfif", ".jif", ".pjpeg", ".pjp")
+IMAGE_SUFFIXES = (".png", *_JPEG, ".webp", ".bmp", ".dib", ".tif", ".tiff")
 HEIC_SUFFIXES = (".heic", ".heif", ".hif")
-_RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf")
-UNREADABLE_SUFFIXES = (*_RAW, *HEIC_SUFFIXES, ".avif", ".gif", ".jxl", ".jp2", ".exr")
+_RAW = (
+    *(".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".sr2", ".srf", ".raf", ".rw2", ".rwl", ".orf"),
+    *(".pef", ".srw", ".x3f", ".3fr", ".fff", ".iiq", ".gpr", ".erf", ".kdc", ".dcr", ".mrw", ".mef", ".mos"),
+)
+_OTHERS = (
+    *(".avif", ".gif", ".jxl", ".jxr", ".jp2", ".j2k", ".jpf", ".jpx", ".mpo"),
+    *(".exr", ".hdr", ".psd", ".tga", ".ppm", ".pgm", ".pnm"),
+)
+UNREADABLE_SUFFIXES = (*_RAW, *HEIC_SUFFIXES, *_OTHERS)
+# How files begin that are pictures whatever their name is; of BMP and of the family of HEIC see `holds_picture`.
+_SIGNATURES = (
+    *(b"\x89PNG\r\n", b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"GIF8"),
+    *(b"\xff\x0a", b"\0\0\0\x0cJXL ", b"\0\0\0\x0cjP  "),
+)
+_FAMILIES = (b"hei", b"hev", b"mif", b"msf", b"avi", b"crx")  # brands, of HEIC, AVIF and Canon's raw
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mpg", ".mpeg", ".mts")
 # What says where the cameras of a scene are, in the order in which it is looked for; a COLMAP model comes second.
 LAYOUT_FILES = {"LLFF": "poses_bounds.npy", "Blender": "transforms_train.json", "nerfstudio": "transforms.json"}
@@ -49,6 +65,9 @@ _MISSPELLED = {
 }
 MASK_FOLDERS = ("masks", "mask")
 MASK_FILES = "dynamic_mask_"  # instant-ngp's, beside the photos
+_MASK_NAME = re.compile(r"mask[ _.-](.+)|(.+)[ _.-]mask")
+_LIKE_MASKS = re.compile(r"mask|segment|matte")  # in names of folders
+MASKS_ARE_IN = "masks are read from masks/, or from the folder that --masks names"
 CAMERAS_REPORT = "photos.json"  # beside a scene whose cameras kgs found: how they were found
 _NO_POSES = "kgs fit finds them; or run COLMAP (its model goes to sparse/0), or nerfstudio's ns-process-data"
 _TO_CONVERT = "photos that cannot be read: convert them to JPEG or PNG"
@@ -63,8 +82,69 @@ def has_heic() -> bool:
 
 def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list[Path]:
     """The photos of a folder, sorted by name; hidden files, masks and other kinds of files are passed over."""
+    masks = {*masks_beside(folder)}
+    return [path for path in list_pictures(folder, suffixes) if path not in masks]
+
+
+def list_pictures(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list[Path]:
+    """As `list_images`, with masks, but for those of instant-ngp."""
     files = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith((".", MASK_FILES))]
-    return sorted(files, key=lambda p: p.name)
+    return sorted((path for path in files if not path.is_dir()), key=lambda p: p.name)
+
+
+def masks_beside(folder: Path) -> dict[Path, Path]:
+    """The photos in a folder by their masks in it, whose names contain those of the photos, see `photo_of_mask`."""
+    pictures = list_pictures(folder, UNREADABLE_SUFFIXES) + list_pictures(folder)
+    of_name = {path.name.lower(): path for path in pictures}
+    of_stem = {path.stem.lower(): path for path in pictures}
+    masks = dict[Path, Path]()
+    for path in pictures:
+        name, is_marked = photo_of_mask(path)
+        photo = of_name.get(name) or (of_stem.get(name) if is_marked else None)
+        if photo is not None and path.suffix.lower() in IMAGE_SUFFIXES:
+            masks[path] = photo
+    return masks
+
+
+def photo_of_mask(mask: Path) -> tuple[str, bool]:
+    """The name or stem of the photo, in lower case, that a file is a mask of if it is one; whether its name says so.
+
+    It is "img_1" of `IMG_1_mask.png`, `mask_IMG_1.png` and `IMG_1.png`, and "img_1.jpg" of `IMG_1.jpg.png`. The first
+    two say that they are masks.
+    """
+    stem = mask.stem.lower()
+    match = _MASK_NAME.fullmatch(stem)
+    return (match[1] or match[2], True) if match else (stem, False)
+
+
+def mask_folders(places: Iterable[Path]) -> list[Path]:
+    """The folders of masks in other folders: `masks` first, then `mask`, in upper or lower case."""
+    found = []
+    for place in filter(Path.is_dir, places):
+        inner = [path for path in sorted(place.iterdir()) if path.name.lower() in MASK_FOLDERS and path.is_dir()]
+        found += sorted(inner, key=lambda path: MASK_FOLDERS.index(path.name.lower()))
+    return found
+
+
+def like_masks(root: Path, photos: Sequence[Path]) -> list[Path]:
+    """Folders beside photos that hold pictures of their names and are called like masks, but not as `mask_folders`."""
+    stems = {photo.stem.lower() for photo in photos}
+    places = dict.fromkeys([root, *sorted({photo.parent for photo in photos})])
+    folders = [path for place in filter(Path.is_dir, places) for path in sorted(place.iterdir()) if path.is_dir()]
+    called = [path for path in folders if _LIKE_MASKS.search(path.name.lower()) and path not in mask_folders(places)]
+    return [path for path in called if any(photo_of_mask(picture)[0] in stems for picture in list_pictures(path))]
+
+
+def holds_picture(path: Path) -> bool:
+    """Whether a file is a picture by how it begins, whatever its name is."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(12)
+    except OSError:
+        return False
+    is_webp = head[:4] == b"RIFF" and head[8:12] == b"WEBP"
+    is_bmp = head[:2] == b"BM" and head[6:10] == bytes(4)
+    return is_webp or is_bmp or head.startswith(_SIGNATURES) or (head[4:8] == b"ftyp" and head[8:11] in _FAMILIES)
 
 
 def image_folder(root: Path, name: str = "") -> Path | None:

@@ -125,7 +125,7 @@ class ImageFile:
         kind = _kind(self.path, data[:_LONGEST_SIGNATURE])
         metadata = self.metadata  # the size is checked before anything is decoded
         try:
-            pixels = _decode(kind, data, metadata.profile)
+            pixels = _decode(kind, data)
         except ValueError as error:
             raise DataError(self.path, "", str(error)) from error
         height, width = pixels.shape[:2]
@@ -178,6 +178,8 @@ def is_heic(data: bytes) -> bool:
 
 def _kind(path: Path, head: bytes) -> str:
     """The format of a file that begins with these bytes; a DataError about `path` where it cannot be read."""
+    if not head:
+        raise DataError(path, "", "expected an image, got an empty file")
     if is_heic(head) and folders.has_heic():
         return "HEIC"
     for signature, kind in _KINDS.items():
@@ -332,13 +334,13 @@ def check_size(path: Path, width: int, height: int, size: int) -> None:
         raise DataError(path, "header", f"claims {width}x{height} pixels in {size} bytes: a decompression bomb")
 
 
-def _decode(kind: str, data: bytes, profile: Profile) -> Image:
+def _decode(kind: str, data: bytes) -> Image:
     """RGB or RGBA in [0, 1] of an image's bytes, whose size was checked; a ValueError where it cannot be decoded."""
     try:
         if kind == "JPEG":
             return _to_float(_decode_jpeg(data))
         if kind == "TIFF":
-            return _decode_tiff(data, profile)
+            return _decode_tiff(data)
         image = _open(kind, io.BytesIO(data))
         if kind == "PNG":
             _open(kind, io.BytesIO(data)).verify()  # the check sums, which decoders pass over
@@ -395,7 +397,7 @@ def _decode_jpeg(data: bytes) -> NDArray[np.uint8]:
     return np.asarray(kornia_io.decode_image_jpegturbo(data, "rgb"))
 
 
-def _decode_tiff(data: bytes, profile: Profile) -> Image:
+def _decode_tiff(data: bytes) -> Image:
     """RGB or RGBA in [0, 1] of a TIFF, as stored, its colours not multiplied by alpha."""
     image = _open("TIFF", io.BytesIO(data))
     tags = image.tag_v2  # type: ignore[attr-defined]  # of TIFF only
@@ -407,7 +409,7 @@ def _decode_tiff(data: bytes, profile: Profile) -> Image:
     bits = max(tags.get(_BITS, (1,)))
     # Pillow leaves out a fourth sample of unspecified meaning and rounds when it divides colours by alpha.
     if tags.get(_COLORS) == _CMYK and bits <= 8 and samples == 4:
-        pixels = _to_float(np.asarray(cmyk_to_rgb(image, profile if isinstance(profile, bytes) else b"")))
+        pixels = _to_float(np.asarray(cmyk_to_rgb(image, image.info.get("icc_profile", b""))))
     elif bits <= 8 and (samples != 4 or alpha == _ALPHA):
         pixels = _to_float(_decode_with_pillow(image))
     else:

@@ -18,7 +18,7 @@ from torch import Tensor
 from kgs.errors import DataError, listed
 
 from .border import with_border
-from .folders import CAMERAS_REPORT
+from .folders import CAMERAS_REPORT, MASKS_ARE_IN, like_masks
 from .frames import LARGEST, Frame, FrameSet
 from .image_file import color_notes
 from .images import rectification, remap, resize
@@ -150,8 +150,11 @@ def _with_masks(root: Path, frame_set: FrameSet, folder: Path | None) -> FrameSe
         return frame_set
     photos = [frame.path for frames in parts for frame in frames]
     found = find_masks(photos, mask_folder(root, photos) if folder is None else folder)
+    notes = frame_set.notes
+    if not found and (unused := like_masks(root, photos)):
+        notes += (f"{listed([path.name for path in unused])} not used: {MASKS_ARE_IN}",)
     frames, test = ([replace(frame, mask=found.get(frame.path)) for frame in frames] for frames in parts)
-    return replace(frame_set, frames=frames, test=None if frame_set.test is None else test)
+    return replace(frame_set, frames=frames, test=None if frame_set.test is None else test, notes=notes)
 
 
 def _mask_notes(frames: Sequence[Frame], train: Views, absent: bool) -> list[str]:

@@ -1,8 +1,9 @@
 """Masks of photos: pictures beside them that say which pixels are kept.
 
-A mask has the photo's stem (or its whole name before the ending, as COLMAP writes them) and lies in `masks/`, in a
-folder that the user names, or where a layout's file says; those of photos in subfolders may lie in subfolders of the
-same names. White is kept. instant-ngp's `dynamic_mask_*.png` beside the photos are the other way round: what is not
+A mask has the photo's stem (or its whole name before the ending, as COLMAP writes them), alone or with `_mask` behind
+it or `mask_` before it, and lies in `masks/`, in a folder that the user names, or where a layout's file says; those of
+photos in subfolders may lie in subfolders of the same names. One whose name says that it is a mask may lie beside its
+photo. White is kept. instant-ngp's `dynamic_mask_*.png` beside the photos are the other way round: what is not
 black there moves, and is not kept.
 
 Sources: https://docs.nerf.studio/quickstart/data_conventions.html (masks); instant-ngp, docs/nerf_dataset_tips.md.
@@ -17,7 +18,7 @@ import numpy as np
 
 from kgs.errors import DataError
 
-from .folders import MASK_FILES, MASK_FOLDERS, list_images
+from .folders import MASK_FILES, list_images, list_pictures, mask_folders, masks_beside, photo_of_mask
 from .image_file import Image, ImageFile
 from .images import Intrinsics
 
@@ -51,17 +52,17 @@ class Mask(NamedTuple):
 def mask_folder(root: Path, photos: Sequence[Path]) -> Path | None:
     """The folder of masks beside a scene's photos or their folder, None if there is none with a picture in it."""
     places = dict.fromkeys([root, *sorted({photo.parent for photo in photos})])
-    folders = (place / name for place in places for name in MASK_FOLDERS if (place / name).is_dir())
-    return next((folder for folder in folders if _pictures(folder, photos)), None)
+    return next((folder for folder in mask_folders(places) if _pictures(folder, photos)), None)
 
 
 def find_masks(photos: Sequence[Path], folder: Path | None) -> dict[Path, Mask]:
-    """The masks of photos: those in a folder, and instant-ngp's beside photos that have none there.
+    """The masks of photos: those in a folder, and those beside photos that have none there.
 
     Raises:
         DataError: the folder does not exist, or holds no masks, one that fits no photo or several, or two that fit one.
     """
     found = {photo: Mask(ImageFile(beside), keeps_white=False) for photo in photos if (beside := _dynamic(photo))}
+    found |= _beside(photos)
     if folder is None:
         return found
     if not folder.is_dir():
@@ -89,13 +90,28 @@ def _pictures(folder: Path, photos: Sequence[Path]) -> list[Path]:
     parts = {photo.parent.parts for photo in photos}
     inner = {Path(*names[-depth:]) for names in parts for depth in (1, 2) if len(names) > depth}
     places = [folder, *sorted(folder / names for names in inner if (folder / names).is_dir())]
-    return [mask for place in places for mask in list_images(place)]
+    return [mask for place in places for mask in list_pictures(place)]
+
+
+def _beside(photos: Sequence[Path]) -> dict[Path, Mask]:
+    """The masks that lie among the photos and say by their names that they are."""
+    found = dict[Path, Path]()
+    known = set(photos)
+    for place in filter(Path.is_dir, sorted({photo.parent for photo in photos})):
+        for mask, photo in masks_beside(place).items():
+            if photo not in known or mask in known:
+                continue
+            if photo in found:
+                raise DataError(mask, "", f"expected one mask of {photo.name}, got {found[photo].name} too")
+            found[photo] = mask
+    return {photo: Mask(ImageFile(mask)) for photo, mask in found.items()}
 
 
 def _fits(mask: Path, photo: Path, folder: Path) -> bool:
     inner = mask.parent.relative_to(folder).parts
     is_there = photo.parent.parts[len(photo.parent.parts) - len(inner) :] == inner
-    return is_there and mask.stem.lower() in (photo.stem.lower(), photo.name.lower())
+    names = photo.stem.lower(), photo.name.lower()
+    return is_there and (mask.stem.lower() in names or photo_of_mask(mask)[0] in names)
 
 
 def _dynamic(photo: Path) -> Path | None:

@@ -20,6 +20,7 @@ from kgs.app.files.publishing import publish, replacing
 from kgs.app.sfm import pose, pose_photos
 from kgs.app.sfm.find import find_photos, notes_on
 from kgs.app.sfm.read import blurred, open_photos, read_photos
+from kgs.datasets.masks import mask_folder
 from kgs.errors import DataError
 from kgs.progress import silent
 
@@ -131,6 +132,76 @@ def test_a_raw_file_beside_its_photo_is_passed_over(folder, heic, monkeypatch):
     said = " ".join(notes_on(folder))
     for name in ("0.DNG", "1.dng", "2.HEIC"):
         assert name in said
+
+
+@pytest.mark.parametrize("suffix", ["jfif", "JPE", "jif", "pjpeg", "Jpeg", "TIF", "dib", "webp"])
+def test_a_photo_is_taken_whatever_its_ending_is_called(folder, suffix):
+    save(folder, planes())
+    kind = {"dib": "bmp", "webp": "webp", "TIF": "tiff"}.get(suffix, "jpg")
+    (folder / f"3.{suffix}").write_bytes(cv2.imencode(f".{kind}", planes()[0])[1].tobytes())
+    paths = find_photos(folder)
+    assert paths[-1].name == f"3.{suffix}"
+    assert len(read_photos(open_photos(paths), silent)) == 4
+    assert not notes_on(folder)
+
+
+@pytest.mark.parametrize("suffix", ["avif", "JXL", "jp2", "gif", "pef", "ppm", "mpo"])
+def test_a_photo_of_another_kind_is_named(folder, suffix):
+    save(folder, planes())
+    (folder / f"3.{suffix}").write_bytes(b"any")
+    with pytest.raises(DataError, match=rf"1 of 4 photos cannot be read \(3\.{suffix}\)"):
+        find_photos(folder)
+
+
+def fill_with_odd_ones(folder):
+    jpeg = cv2.imencode(".jpg", planes()[0])[1].tobytes()
+    for name in ("IMG_4", ".IMG_5.jpg", "IMG_6.jpg_original", "._IMG_7.jpg", "notes.txt", "BM.txt", "IMG_8.xmp"):
+        (folder / name).write_bytes(jpeg if name[-1] in "4l" or name == ".IMG_5.jpg" else b"BM or other notes")
+    (folder / "._IMG_7.jpg").write_bytes(b"\0\5\x16\7" + bytes(100))  # of macOS, beside each file on a foreign disk
+    (folder / "IMG_9.jpg").mkdir()
+    save(folder / "more", planes()[:1])
+    (folder / "empty").mkdir()
+
+
+def test_what_looks_like_a_photo_and_is_not_taken_is_named(folder, refused):
+    fill_with_odd_ones(folder)
+    said = refused(folder.rename(folder.with_name("none")), "these folders in it do: more", "IMG_4")
+    fill_with_odd_ones(save(folder, planes()))
+    assert [path.name for path in find_photos(folder)] == ["0.png", "1.png", "2.png"]
+    said = " ".join(notes_on(folder))
+    for name in ("IMG_4", ".IMG_5.jpg", "IMG_6.jpg_original", "IMG_9.jpg", "more"):
+        assert name in said
+    for name in ("IMG_7", "notes", "BM.txt", "IMG_8", "empty"):
+        assert name not in said
+
+
+def test_an_empty_file_is_named(folder, refused):
+    save(folder, planes(), z_jpg=b"")
+    refused(folder, "z.jpg: expected an image, got an empty file")
+
+
+@pytest.mark.parametrize("name", ["0_mask.png", "0.png.png", "mask_0.PNG", "Masks/0.png", "masks/0-mask.png"])
+def test_masks_beside_photos_are_used_and_no_photos(folder, name):
+    save(folder, planes())
+    mask = np.full((180, 240), 255, np.uint8)
+    mask[:, :40] = 0
+    save(folder / name.rpartition("/")[0], [mask], [name.rpartition("/")[2]])
+    paths = find_photos(folder)
+    assert [path.name for path in paths] == ["0.png", "1.png", "2.png"]
+    photos = read_photos(open_photos(paths, mask_folder(folder, paths)), silent)
+    np.testing.assert_array_equal(photos[0].mask, mask)
+    assert photos[1].mask is None
+    assert not notes_on(folder)
+
+
+def test_what_looks_like_masks_and_is_not_used_is_named(folder):
+    save(save(save(folder, planes()) / "segmentation", planes()[:1]).parent, planes()[:1], ["IMG_9_mask.png"])
+    assert len(find_photos(folder)) == 4
+    segmentation, lone = notes_on(folder)
+    assert "segmentation" in segmentation
+    assert "--masks" in segmentation
+    assert "IMG_9_mask.png" in lone
+    assert notes_on(folder, folder / "segmentation") == [lone]
 
 
 @pytest.mark.slow

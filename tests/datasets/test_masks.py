@@ -77,9 +77,26 @@ def larger_and_coloured(root: Path) -> None:
     write_mask(root / "mask" / "0.jpg", np.repeat(mask[..., None], 3, 2))
 
 
+def written_as(name: str) -> Callable[[Path], None]:
+    def write(root: Path) -> None:
+        write_colmap(root)  # 0.PNG and others
+        write_mask(root / name)
+
+    write.__name__ = name
+    return write
+
+
 @pytest.mark.parametrize(
     "write",
     [
+        *map(
+            written_as,
+            [
+                *("Masks/0.png", "MASK/0.PNG.png", "masks/0_mask.png", "masks/0.mask.png", "masks/mask_0.jpg"),
+                *("masks/0.PNG_mask.png", "images/0_mask.png", "images/0-MASK.PNG", "images/0.mask.png"),
+                *("images/mask_0.png", "images/0.PNG.png", "images/Masks/0.png"),
+            ],
+        ),
         in_mask_folder,
         by_whole_name,
         in_the_file,
@@ -101,6 +118,41 @@ def test_black_is_looked_away_from(tmp_path: Path, write: Callable[[Path], None]
     assert 0.4 < float(counted[0].float().mean()) < 0.6
     assert any("masks of 1 of 3 photos" in note for note in scene.notes)
     assert scene.train.masks is None
+
+
+@pytest.mark.parametrize("name", ["0_mask.png", "0.png.png", "dynamic_mask_0.png"])
+def test_masks_among_photos_are_not_counted_as_photos(tmp_path: Path, name: str) -> None:
+    """A layout that takes all photos of a folder."""
+    write_llff(tmp_path)
+    write_mask(tmp_path / "images" / name)
+    scene = load_scene(tmp_path, hold_out=0)
+    assert len(scene.train) == 3
+    assert scene.train.counted is not None
+
+
+def test_photos_whose_names_only_look_like_masks_stay_photos(tmp_path: Path) -> None:
+    """As of a carnival mask; and a model may name what looks like a mask of another photo."""
+    write_llff(tmp_path)
+    for path in sorted((tmp_path / "images").iterdir()):
+        path.rename(path.with_name(f"mask_{path.name}"))
+    assert load_scene(tmp_path, hold_out=0).train.counted is None
+    write_nerfstudio(tmp_path / "named")
+    data = json.loads((tmp_path / "named" / "transforms.json").read_text())
+    (tmp_path / "named" / "images" / "1.png").rename(tmp_path / "named" / "images" / "0_mask.png")
+    data["frames"][1]["file_path"] = "images/0_mask.png"
+    (tmp_path / "named" / "transforms.json").write_text(json.dumps(data))
+    assert load_scene(tmp_path / "named", hold_out=0).train.counted is None
+
+
+@pytest.mark.parametrize("name", ["segmentation", "Person_Masks"])
+def test_a_folder_that_is_called_like_masks_is_named(tmp_path: Path, name: str) -> None:
+    write_llff(tmp_path)
+    write_mask(tmp_path / name / "0.png")
+    (note,) = load_scene(tmp_path, hold_out=0).notes
+    assert name in note
+    assert "--masks" in note
+    write_mask(tmp_path / "masks" / "0.png")
+    assert name not in " ".join(load_scene(tmp_path, hold_out=0).notes)
 
 
 def test_black_is_not_there(tmp_path: Path) -> None:

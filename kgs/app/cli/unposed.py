@@ -44,10 +44,10 @@ def find_scene(
     from kgs.app.sfm.find import find_video, notes_on
 
     video = find_video(photos)
-    for note in () if video else notes_on(photos):
+    masks = Path(request.masks) if request.masks else None
+    for note in () if video else notes_on(photos, masks):
         say(note)
     with on_ctrl_c("the cameras were not found yet, and nothing was written"):
-        masks = request.masks or None
         report = pose_photos(photos, out, seed=seed, masks=masks, frames=frames, wait=True, bar=each, say=say)
     largest = max(report["size"])
     wanted = largest if size is None else size

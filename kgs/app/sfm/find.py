@@ -2,8 +2,22 @@
 
 from pathlib import Path
 
+from kgs.app.files.ownership import is_own
 from kgs.datasets import folders
-from kgs.datasets.folders import HEIC_SUFFIXES, IMAGE_SUFFIXES, UNREADABLE_SUFFIXES, VIDEO_SUFFIXES, list_images
+from kgs.datasets.folders import (
+    HEIC_SUFFIXES,
+    IMAGE_SUFFIXES,
+    MASK_FILES,
+    MASKS_ARE_IN,
+    UNREADABLE_SUFFIXES,
+    VIDEO_SUFFIXES,
+    holds_picture,
+    like_masks,
+    list_images,
+    mask_folders,
+    masks_beside,
+    photo_of_mask,
+)
 from kgs.errors import DataError, listed
 
 FEWEST = 3
@@ -44,10 +58,10 @@ def find_photos(folder: Path) -> list[Path]:
             reason = f"holds no photos itself, but these folders in it do: {listed_files(deeper)}. Name one of them"
         else:
             reason = f"expected photos ({' '.join(IMAGE_SUFFIXES)}), found none. {ADVICE}"
-        raise DataError(folder, "", ". ".join([reason, *folders.unused_files(folder)]))
+        raise DataError(folder, "", ". ".join([reason, *folders.unused_files(folder), *_passed_over(folder)]))
     if len(paths) < FEWEST:
         reason = f"expected at least {FEWEST} photos, found {len(paths)} ({listed_files(paths)}). {ADVICE}"
-        raise DataError(folder, "", reason)
+        raise DataError(folder, "", ". ".join([reason, *_passed_over(folder)]))
     return paths
 
 
@@ -71,11 +85,32 @@ def list_photos(folder: Path) -> list[Path]:
     return [path for path in list_images(folder, _readable()) if path.is_file() and path not in converted]
 
 
-def notes_on(folder: Path) -> list[str]:
-    """What a folder of photos holds that is not used, a sentence each."""
-    notes = list(folders.unused_files(folder))
+def notes_on(folder: Path, masks: Path | None = None) -> list[str]:
+    """What a folder of photos holds that is not used, a sentence each; `masks` is a folder of masks that is named."""
+    notes = [*folders.unused_files(folder), *_passed_over(folder, masks)]
+    if lone := [path for path in list_photos(folder) if photo_of_mask(path)[1]]:
+        notes.append(f"taken for photos, because no photos are there whose masks they would be: {listed_files(lone)}")
     if converted := sorted(_converted(folder)):
         notes.append(f"{len(converted)} raw or HEIC files are not used, but their JPEGs: {listed_files(converted)}")
+    return notes
+
+
+def _passed_over(folder: Path, masks: Path | None = None) -> list[str]:
+    """What looks like photos or masks and is not taken: files without a known ending, and folders."""
+    known = {*list_images(folder, (*IMAGE_SUFFIXES, *UNREADABLE_SUFFIXES)), *masks_beside(folder)}
+    others = [path for path in sorted(folder.iterdir()) if path not in known and not path.name.startswith(MASK_FILES)]
+    notes = []
+    if pictures := [path for path in others if path.is_file() and holds_picture(path)]:
+        notes.append(f"pictures that are not used, hidden or without a known ending: {listed_files(pictures)}")
+    used = [path.resolve() for path in (*mask_folders([folder]), *filter(None, [masks]))]
+    inner = [path for path in others if path.is_dir() and path.resolve() not in used]
+    like = [path for path in like_masks(folder, list_photos(folder)) if path in inner]
+    if like and not used and not masks_beside(folder):
+        notes.append(f"not used: {listed_files(like)}: {MASKS_ARE_IN}")
+        inner = [path for path in inner if path not in like]
+    called = {path for path in inner if path.suffix.lower() in IMAGE_SUFFIXES}
+    if deeper := [path for path in inner if path in called or (_holds_photos(path) and not is_own(path))]:
+        notes.append(f"not looked into, because they are folders: {listed_files(deeper)}")
     return notes
 
 
