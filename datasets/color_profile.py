@@ -193,7 +193,7 @@ def _to_xyz(primaries: tuple[tuple[float, float], ...], white: tuple[float, floa
 def _adaptation(white: tuple[float, float]) -> NDArray[np.float64]:
     """The matrix that moves a white point to that of sRGB (Bradford)."""
     ratio = (_BRADFORD @ _xyz(_D65)) / (_BRADFORD @ _xyz(white))
-    return np.linalg.inv(_BRADFORD) @ np.diag(ratio) @ _BRADFORD
+    return np.asarray(np.linalg.inv(_BRADFORD) @ np.diag(ratio) @ _BRADFORD)
 
 
 def _xyz(place: tuple[float, float]) -> NDArray[np.float64]:

@@ -3,6 +3,7 @@
 import struct
 import subprocess
 import sys
+from fractions import Fraction
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,7 @@ from command import run
 from init_point_scenes import texture
 
 from kgs.app.sfm.find import find_video
-from kgs.app.sfm.video import FRAMES, take_frames
+from kgs.app.sfm.video import FRAMES, _Reader, take_frames
 from kgs.errors import DataError
 from kgs.progress import silent
 
@@ -63,16 +64,97 @@ def test_how_many_frames(tmp_path, degrees, count, expected):
     assert len(take(write_video(tmp_path / "clip.avi", equal), count)) == expected
 
 
-def test_a_frame_is_upright_as_the_header_says(tmp_path):
-    video = write_video(tmp_path / "clip.mp4", np.linspace(0, 20, 30).tolist())
+def turn_by_a_quarter(video: Path) -> None:
+    """Change the matrix in the header of an MP4."""
     data = video.read_bytes()
     at = data.index(b"tkhd") + 4 + 40  # version, flags, times, ids, duration, layer and volume, then the matrix
     one = 1 << 16
     turned = struct.pack(">9i", 0, one, 0, -one, 0, 0, SIZE[1] * one, 0, 1 << 30)
     video.write_bytes(data[:at] + turned + data[at + 36 :])
+
+
+def test_a_frame_is_upright_as_the_header_says(tmp_path):
+    video = write_video(tmp_path / "clip.mp4", np.linspace(0, 20, 30).tolist())
+    turn_by_a_quarter(video)
     take(video, 3)
     first = cv2.imread(str(next(video.with_suffix("").iterdir())))
     assert first.shape[:2] == (SIZE[0], SIZE[1])  # 240 wide, 320 high
+
+
+@pytest.mark.parametrize(("aspect", "size"), [("1", (320, 240)), ("4/3", (427, 240)), ("8/9", (320, 270))])
+@pytest.mark.parametrize("name", ["clip.mkv", "clip.mp4", "turned.mp4"])
+def test_pixels_become_square(tmp_path, aspect, size, name):
+    """A circle is one, as the header says the shape of pixels: HDV has 4:3, DVDs 8:9 for instance."""
+    av = pytest.importorskip("av")
+    shape = Fraction(aspect)
+    picture = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+    cv2.ellipse(picture, (160, 120), (round(80 / shape), 80), 0, 0, 360, (255, 255, 255), -1)
+    with av.open(str(tmp_path / name), "w") as container:
+        stream = container.add_stream("mpeg4", rate=10, options={"qscale": "1"})
+        stream.width, stream.height = SIZE
+        stream.pix_fmt = "yuv420p"
+        stream.codec_context.sample_aspect_ratio = shape
+        for packet in [*stream.encode(av.VideoFrame.from_ndarray(picture, "bgr24")), *stream.encode()]:
+            container.mux(packet)
+    if name == "turned.mp4":
+        turn_by_a_quarter(tmp_path / name)
+    with _Reader(tmp_path / name) as reader:
+        frame = reader.read(0)
+    assert frame.shape[1::-1] == (size[::-1] if name == "turned.mp4" else size)
+    rows, columns = np.nonzero(frame[..., 1] > 128)
+    assert np.ptp(rows) == pytest.approx(np.ptp(columns), abs=3)
+
+
+@pytest.mark.parametrize(("space", "width"), [("ITU601", 320), ("ITU709", 320), ("ITU709", 1280)])
+@pytest.mark.parametrize("full", [False, True])
+def test_colours_are_those_that_the_header_says(tmp_path, space, width, full):
+    """The matrix of BT.601 or 709, and the full or the limited range: OpenCV's work."""
+    av = pytest.importorskip("av")
+    reformatter = pytest.importorskip("av.video.reformatter")
+    matrix = reformatter.Colorspace[space]
+    scale = reformatter.ColorRange.JPEG if full else reformatter.ColorRange.MPEG
+    path = tmp_path / "clip.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=10)
+        stream.width, stream.height, stream.pix_fmt = width, width * 9 // 16, "yuv420p"
+        number = 1 if space == "ITU709" else 6
+        stream.codec_context.colorspace = stream.codec_context.color_primaries = stream.codec_context.color_trc = number
+        stream.codec_context.color_range = 2 if full else 1
+        picture = np.full((width * 9 // 16, width, 3), (200, 60, 30), np.uint8)
+        frame = av.VideoFrame.from_ndarray(picture, "rgb24")
+        frame = frame.reformat(format="yuv420p", dst_colorspace=matrix, src_color_range=2, dst_color_range=scale)
+        for packet in [*stream.encode(frame), *stream.encode()]:
+            container.mux(packet)
+    with _Reader(path) as reader:
+        found = reader.read(0)
+    np.testing.assert_allclose(found[..., ::-1].mean((0, 1)), [200, 60, 30], atol=4)
+
+
+def test_of_interlaced_frames_every_second_row_is_taken(tmp_path):
+    """The odd rows are as far on as the next frame: of the rows that are left each shows one moment."""
+    plain = write_video(tmp_path / "plain.avi", np.linspace(0, 20, 61).tolist())
+    frames = []
+    with _Reader(plain) as reader:
+        while (frame := reader.read(len(frames))) is not None:
+            frames.append(frame)
+    path = tmp_path / "clip.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30, SIZE)
+    writer.set(cv2.VIDEOWRITER_PROP_QUALITY, 100)
+    for first, second in zip(frames[::2], frames[1::2], strict=False):
+        woven = first.copy()
+        woven[1::2] = second[1::2]
+        writer.write(woven)
+    writer.release()
+    (tmp_path / "frames").mkdir()
+    lines: list[str] = []
+    paths = take_frames(path, tmp_path / "frames", 5, silent, lines.append)
+    assert "interlaced" in lines[0]
+    for taken in paths:
+        number = int(taken.stem.removeprefix("frame_"))
+        found = cv2.imread(str(taken))
+        one_moment = frames[2 * number].astype(float)
+        assert found.shape == one_moment.shape
+        assert np.abs(found - one_moment).mean() < np.abs(found - np.roll(one_moment, 4, axis=1)).mean()
 
 
 def broken(path: Path) -> Path:
