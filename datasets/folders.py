@@ -66,8 +66,10 @@ _MISSPELLED = {
 MASK_FOLDERS = ("masks", "mask")
 MASK_FILES = "dynamic_mask_"  # instant-ngp's, beside the photos
 _MASK_NAME = re.compile(r"mask[ _.-](.+)|(.+)[ _.-]mask")
-_LIKE_MASKS = re.compile(r"mask|segment|matte")  # in names of folders
-MASKS_ARE_IN = "masks are read from masks/, or from the folder that --masks names"
+_LIKE_MASKS = re.compile(
+    r"mask|matte|segment|(?<![a-z])(seg|alpha)(?![a-z])"
+)  # names that only look like those of masks
+MASKS_ARE_IN = "masks are in masks/ or the folder that --masks names, or beside their photos as IMG_1_mask.png"
 CAMERAS_REPORT = "photos.json"  # beside a scene whose cameras kgs found: how they were found
 _NO_POSES = "kgs fit finds them; or run COLMAP (its model goes to sparse/0), or nerfstudio's ns-process-data"
 _TO_CONVERT = "photos that cannot be read: convert them to JPEG or PNG"
@@ -131,8 +133,14 @@ def like_masks(root: Path, photos: Sequence[Path]) -> list[Path]:
     stems = {photo.stem.lower() for photo in photos}
     places = dict.fromkeys([root, *sorted({photo.parent for photo in photos})])
     folders = [path for place in filter(Path.is_dir, places) for path in sorted(place.iterdir()) if path.is_dir()]
-    called = [path for path in folders if _LIKE_MASKS.search(path.name.lower()) and path not in mask_folders(places)]
+    known = mask_folders(places)
+    called = [path for path in folders if is_like_mask(path) and path not in known]
     return [path for path in called if any(photo_of_mask(picture)[0] in stems for picture in list_pictures(path))]
+
+
+def is_like_mask(path: Path) -> bool:
+    """Whether a folder or picture that is not taken for masks is called like one."""
+    return _LIKE_MASKS.search(path.stem.lower()) is not None
 
 
 def holds_picture(path: Path) -> bool:

@@ -18,7 +18,7 @@ from torch import Tensor
 from kgs.errors import DataError, listed
 
 from .border import with_border
-from .folders import CAMERAS_REPORT, MASKS_ARE_IN, like_masks
+from .folders import CAMERAS_REPORT, MASKS_ARE_IN, is_like_mask, like_masks, list_images
 from .frames import LARGEST, Frame, FrameSet
 from .image_file import color_notes
 from .images import rectification, remap, resize
@@ -151,8 +151,11 @@ def _with_masks(root: Path, frame_set: FrameSet, folder: Path | None) -> FrameSe
     photos = [frame.path for frames in parts for frame in frames]
     found = find_masks(photos, mask_folder(root, photos) if folder is None else folder)
     notes = frame_set.notes
-    if not found and (unused := like_masks(root, photos)):
-        notes += (f"{listed([path.name for path in unused])} not used: {MASKS_ARE_IN}",)
+    places = sorted({photo.parent for photo in photos})
+    beside = [path for place in filter(Path.is_dir, places) for path in list_images(place) if is_like_mask(path)]
+    unused = [path.name for path in (*sorted({*beside} - {*photos}), *([] if found else like_masks(root, photos)))]
+    if unused:
+        notes += (f"called like masks and not used: {listed(unused, _LISTED)}: {MASKS_ARE_IN}",)
     frames, test = ([replace(frame, mask=found.get(frame.path)) for frame in frames] for frames in parts)
     return replace(frame_set, frames=frames, test=None if frame_set.test is None else test, notes=notes)
 

@@ -116,10 +116,11 @@ def test_what_a_folder_holds_instead_is_told(tmp_path, refused, kind):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="links need rights there")
-def test_a_link_to_a_photo_that_is_gone(folder, refused):
+@pytest.mark.parametrize("name", ["3.png", "3.jfif", "3.dng"])
+def test_a_link_to_a_photo_that_is_gone(folder, refused, name):
     save(folder, small(planes()))
-    (folder / "3.png").symlink_to("gone.png")
-    refused(folder, "links to files that are not there: 3.png")
+    (folder / name).symlink_to("gone")
+    refused(folder, f"links to files that are not there: {name}")
 
 
 @pytest.mark.parametrize("heic", [True, False])
@@ -194,14 +195,16 @@ def test_masks_beside_photos_are_used_and_no_photos(folder, name):
     assert not notes_on(folder)
 
 
-def test_what_looks_like_masks_and_is_not_used_is_named(folder):
-    save(save(save(folder, planes()) / "segmentation", planes()[:1]).parent, planes()[:1], ["IMG_9_mask.png"])
-    assert len(find_photos(folder)) == 4
-    segmentation, lone = notes_on(folder)
-    assert "segmentation" in segmentation
-    assert "--masks" in segmentation
-    assert "IMG_9_mask.png" in lone
-    assert notes_on(folder, folder / "segmentation") == [lone]
+def test_what_is_called_like_masks_and_is_not_used_is_named(folder):
+    save(save(folder, planes()) / "segmentation", planes()[:1])
+    lone = ["0 (mask).png", "0_seg.png", "9_mask.png", "mask.png"]
+    save(folder, [planes()[0]] * 4, lone)
+    assert len(find_photos(folder)) == 7
+    unused, taken = notes_on(folder)
+    assert "segmentation" in unused
+    assert "--masks" in unused
+    assert ", ".join(lone) in taken
+    assert notes_on(folder, folder / "segmentation") == [taken]
 
 
 @pytest.mark.slow

@@ -144,6 +144,13 @@ def test_photos_whose_names_only_look_like_masks_stay_photos(tmp_path: Path) -> 
     assert load_scene(tmp_path / "named", hold_out=0).train.counted is None
 
 
+def test_a_picture_beside_photos_that_is_called_like_a_mask_is_named(tmp_path: Path) -> None:
+    write_colmap(tmp_path)
+    write_mask(tmp_path / "images" / "0_seg.png")
+    (note,) = load_scene(tmp_path, hold_out=0).notes
+    assert "0_seg.png" in note
+
+
 @pytest.mark.parametrize("name", ["segmentation", "Person_Masks"])
 def test_a_folder_that_is_called_like_masks_is_named(tmp_path: Path, name: str) -> None:
     write_llff(tmp_path)

@@ -12,11 +12,11 @@ from kgs.datasets.folders import (
     UNREADABLE_SUFFIXES,
     VIDEO_SUFFIXES,
     holds_picture,
+    is_like_mask,
     like_masks,
     list_images,
     mask_folders,
     masks_beside,
-    photo_of_mask,
 )
 from kgs.errors import DataError, listed
 
@@ -41,12 +41,13 @@ def find_photos(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise DataError(folder, "", "expected a folder of photos, found no such folder")
     paths = list_photos(folder)
-    if lost := [path for path in list_images(folder, _readable()) if not path.exists()]:
+    converted = _converted(folder)
+    kinds = (*IMAGE_SUFFIXES, *UNREADABLE_SUFFIXES)
+    if lost := [path for path in list_images(folder, kinds) if not path.exists() and path not in converted]:
         raise DataError(folder, "", f"expected photos, got links to files that are not there: {listed_files(lost)}")
     files = [path for path in sorted(folder.iterdir()) if path.is_file() and not path.name.startswith(".")]
     videos = [path for path in files if _is_video(path)]
     unreadable = set(UNREADABLE_SUFFIXES).difference(_readable())
-    converted = _converted(folder)
     if others := [path for path in files if path.suffix.lower() in unreadable and path not in converted]:
         wrong = f"{len(others)} of {len(others) + len(paths)} photos cannot be read ({listed_files(others)}). "
         raise DataError(folder, "", wrong + CONVERT)
@@ -88,8 +89,8 @@ def list_photos(folder: Path) -> list[Path]:
 def notes_on(folder: Path, masks: Path | None = None) -> list[str]:
     """What a folder of photos holds that is not used, a sentence each; `masks` is a folder of masks that is named."""
     notes = [*folders.unused_files(folder), *_passed_over(folder, masks)]
-    if lone := [path for path in list_photos(folder) if photo_of_mask(path)[1]]:
-        notes.append(f"taken for photos, because no photos are there whose masks they would be: {listed_files(lone)}")
+    if called := [path for path in list_photos(folder) if is_like_mask(path)]:
+        notes.append(f"called like masks and taken for photos: {listed_files(called)}: {MASKS_ARE_IN}")
     if converted := sorted(_converted(folder)):
         notes.append(f"{len(converted)} raw or HEIC files are not used, but their JPEGs: {listed_files(converted)}")
     return notes
@@ -106,7 +107,7 @@ def _passed_over(folder: Path, masks: Path | None = None) -> list[str]:
     inner = [path for path in others if path.is_dir() and path.resolve() not in used]
     like = [path for path in like_masks(folder, list_photos(folder)) if path in inner]
     if like and not used and not masks_beside(folder):
-        notes.append(f"not used: {listed_files(like)}: {MASKS_ARE_IN}")
+        notes.append(f"called like masks and not used: {listed_files(like)}: {MASKS_ARE_IN}")
         inner = [path for path in inner if path not in like]
     called = {path for path in inner if path.suffix.lower() in IMAGE_SUFFIXES}
     if deeper := [path for path in inner if path in called or (_holds_photos(path) and not is_own(path))]:
