@@ -6,7 +6,6 @@ in which the chunks of a PNG count; IEC 61966-2-1 (sRGB).
 """
 
 import io
-from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple, Self
 
@@ -51,12 +50,12 @@ class Colors(NamedTuple):
     gamma: float | None = None  # exponent of the light over the value; None: sRGB's curve
 
     @classmethod
-    def of(cls, places: Sequence[Any], gamma: Any = None) -> Self | None:
-        """Those of a file's numbers: x and y of white, red, green and blue; None where they describe no colours."""
+    def of(cls, white: Any, primaries: Any, gamma: Any = None) -> Self | None:
+        """Those of a file's numbers: x and y of white, and of red, green and blue; None where they are damaged."""
         try:
-            numbers = [float(number) for number in (*places, gamma or 1)]
-            white, *primaries = zip(numbers[:8:2], numbers[1:8:2], strict=True)
-            described = cls(tuple(primaries), white, numbers[8] if gamma else None)
+            numbers = [float(number) for number in (*white, *primaries, gamma or 1)]
+            places = tuple(zip(numbers[:8:2], numbers[1:8:2], strict=True))
+            described = cls(places[1:], places[0], numbers[8] if gamma else None)
             matrix = _to_xyz(described.primaries, described.white)
         except (TypeError, ValueError, ArithmeticError, IndexError, np.linalg.LinAlgError):
             return None

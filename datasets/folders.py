@@ -66,9 +66,8 @@ _MISSPELLED = {
 MASK_FOLDERS = ("masks", "mask")
 MASK_FILES = "dynamic_mask_"  # instant-ngp's, beside the photos
 _MASK_NAME = re.compile(r"mask[ _.-](.+)|(.+)[ _.-]mask")
-_LIKE_MASKS = re.compile(
-    r"mask|matte|segment|(?<![a-z])(seg|alpha)(?![a-z])"
-)  # names that only look like those of masks
+# Names that only look like those of masks.
+_LIKE_MASKS = re.compile(r"mask|matte|segment|(?<![a-z])(seg|alpha)(?![a-z])")
 MASKS_ARE_IN = "masks are in masks/ or the folder that --masks names, or beside their photos as IMG_1_mask.png"
 CAMERAS_REPORT = "photos.json"  # beside a scene whose cameras kgs found: how they were found
 _NO_POSES = "kgs fit finds them; or run COLMAP (its model goes to sparse/0), or nerfstudio's ns-process-data"

@@ -287,7 +287,7 @@ def _profile(kind: str, image: Opened, file: IO[bytes], chunks: dict[bytes, byte
     if kind == "PNG" and ("gamma" in image.info or "chromaticity" in image.info):
         places = image.info.get("chromaticity") or (*Colors().white, *sum(Colors().primaries, ()))
         exponent = image.info.get("gamma")
-        return Colors.of(places, 1 / exponent if exponent else None) or b""
+        return Colors.of(places[:2], places[2:], 1 / exponent if exponent else None) or b""
     if nclx := image.info.get("nclx_profile"):
         return colors_of(nclx["color_primaries"], nclx["transfer_characteristics"])
     space = tags.get(_COLOR_SPACE)
@@ -296,7 +296,7 @@ def _profile(kind: str, image: Opened, file: IO[bytes], chunks: dict[bytes, byte
     if space == _IS_ADOBE_RGB or str(tags.get(_INTEROPERABILITY)).startswith("R03"):
         return ADOBE_RGB
     if _WHITE in tags and _PRIMARIES in tags:
-        return Colors.of((*tags[_WHITE], *tags[_PRIMARIES]), tags.get(_GAMMA)) or b""
+        return Colors.of(tags[_WHITE], tags[_PRIMARIES], tags.get(_GAMMA)) or b""
     return b""
 
 
@@ -348,7 +348,7 @@ def _decode(kind: str, data: bytes) -> Image:
             is_one_grey = isinstance(clear, int) and image.mode != "P"
             if data[_PNG_BITS] == 16:
                 pixels = _decode_with_opencv(data)
-                if is_one_grey:  # OpenCV passes it over
+                if is_one_grey and pixels.shape[2] == 3:  # OpenCV passed it over
                     pixels = np.dstack([pixels, np.where(pixels[..., 0] == clear, 0, 65535).astype(np.uint16)])
                 return _to_float(pixels)
             if is_one_grey and image.mode == "L":  # Pillow spreads 2 and 4 bits over 8, but not this number

@@ -176,10 +176,21 @@ P3_PLACES = {318: (0.3127, 0.329), 319: (0.68, 0.32, 0.265, 0.69, 0.15, 0.06)}
         (exif(None, "R03"), ADOBE_TO_SRGB, 563 / 256, False),
         (exif(65535, more=P3_PLACES), P3_TO_SRGB, None, False),
         (exif(65535, more={318: (0.0, 0.0), 319: (0.1,) * 6}), None, None, True),
+        (exif(65535, more={318: 7.0, 319: 1.0}), None, None, True),
         (exif(65535), None, None, True),
         (exif(None), None, None, False),
     ],
-    ids=["sRGB", "sRGB that has both", "2", "index alone", "primaries", "wrong primaries", "uncalibrated", "nothing"],
+    ids=[
+        "sRGB",
+        "sRGB that has both",
+        "2",
+        "index alone",
+        "primaries",
+        "wrong primaries",
+        "no primaries",
+        "uncalibrated",
+        "nothing",
+    ],
 )
 def test_what_exif_says_of_colours(
     tmp_path: Path, block: PIL.Image.Exif, matrix: np.ndarray | None, gamma: float | None, doubted: bool

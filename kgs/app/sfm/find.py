@@ -15,6 +15,7 @@ from kgs.datasets.folders import (
     is_like_mask,
     like_masks,
     list_images,
+    list_pictures,
     mask_folders,
     masks_beside,
 )
@@ -59,10 +60,10 @@ def find_photos(folder: Path) -> list[Path]:
             reason = f"holds no photos itself, but these folders in it do: {listed_files(deeper)}. Name one of them"
         else:
             reason = f"expected photos ({' '.join(IMAGE_SUFFIXES)}), found none. {ADVICE}"
-        raise DataError(folder, "", ". ".join([reason, *folders.unused_files(folder), *_passed_over(folder)]))
+        raise DataError(folder, "", ". ".join([reason, *folders.unused_files(folder), *_nameless(folder)]))
     if len(paths) < FEWEST:
         reason = f"expected at least {FEWEST} photos, found {len(paths)} ({listed_files(paths)}). {ADVICE}"
-        raise DataError(folder, "", ". ".join([reason, *_passed_over(folder)]))
+        raise DataError(folder, "", ". ".join([reason, *_nameless(folder)]))
     return paths
 
 
@@ -88,7 +89,7 @@ def list_photos(folder: Path) -> list[Path]:
 
 def notes_on(folder: Path, masks: Path | None = None) -> list[str]:
     """What a folder of photos holds that is not used, a sentence each; `masks` is a folder of masks that is named."""
-    notes = [*folders.unused_files(folder), *_passed_over(folder, masks)]
+    notes = [*folders.unused_files(folder), *_nameless(folder), *_inner(folder, masks)]
     if called := [path for path in list_photos(folder) if is_like_mask(path)]:
         notes.append(f"called like masks and taken for photos: {listed_files(called)}: {MASKS_ARE_IN}")
     if converted := sorted(_converted(folder)):
@@ -96,15 +97,21 @@ def notes_on(folder: Path, masks: Path | None = None) -> list[str]:
     return notes
 
 
-def _passed_over(folder: Path, masks: Path | None = None) -> list[str]:
-    """What looks like photos or masks and is not taken: files without a known ending, and folders."""
-    known = {*list_images(folder, (*IMAGE_SUFFIXES, *UNREADABLE_SUFFIXES)), *masks_beside(folder)}
-    others = [path for path in sorted(folder.iterdir()) if path not in known and not path.name.startswith(MASK_FILES)]
-    notes = []
-    if pictures := [path for path in others if path.is_file() and holds_picture(path)]:
-        notes.append(f"pictures that are not used, hidden or without a known ending: {listed_files(pictures)}")
+def _nameless(folder: Path) -> list[str]:
+    """A sentence about files that are pictures, and not taken, because they are hidden or without a known ending."""
+    known = {*list_pictures(folder, (*IMAGE_SUFFIXES, *UNREADABLE_SUFFIXES))}
+    files = [path for path in sorted(folder.iterdir()) if path not in known and not path.name.startswith(MASK_FILES)]
+    pictures = [path for path in files if path.is_file() and holds_picture(path)]
+    return (
+        [f"pictures that are not used, hidden or without a known ending: {listed_files(pictures)}"] if pictures else []
+    )
+
+
+def _inner(folder: Path, masks: Path | None) -> list[str]:
+    """A sentence about folders in this one that are called like masks, and one about others that may hold photos."""
     used = [path.resolve() for path in (*mask_folders([folder]), *filter(None, [masks]))]
-    inner = [path for path in others if path.is_dir() and path.resolve() not in used]
+    inner = [path for path in sorted(folder.iterdir()) if path.is_dir() and path.resolve() not in used]
+    notes = []
     like = [path for path in like_masks(folder, list_photos(folder)) if path in inner]
     if like and not used and not masks_beside(folder):
         notes.append(f"called like masks and not used: {listed_files(like)}: {MASKS_ARE_IN}")

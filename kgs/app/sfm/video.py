@@ -216,7 +216,7 @@ class _Reader:
     def read(self, index: int) -> NDArray[np.uint8] | None:
         """A frame, `(H, W, 3)` BGR, not before the last one that was read; None behind the end.
 
-        It has at least the rows and columns that the video has, so that no detail is lost.
+        It is never made smaller to have square pixels.
         """
         while self._next <= index:
             if not self._capture.grab():
