@@ -19,7 +19,7 @@ from kgs.app.files.outputs import write_png
 from kgs.app.files.publishing import publish, replacing
 from kgs.app.sfm import pose, pose_photos
 from kgs.app.sfm.find import find_photos, notes_on
-from kgs.app.sfm.read import blurred, open_photos, read_photos
+from kgs.app.sfm.read import blurred, open_photos, read_photos, sharpness
 from kgs.datasets.masks import mask_folder
 from kgs.errors import DataError
 from kgs.progress import silent
@@ -251,6 +251,15 @@ def test_a_blurred_photo_is_told(folder):
     assert [photo.path.name for photo in blurred(read_photos(open_photos(sorted(folder.iterdir())), silent))] == [
         "1.png"
     ]
+
+
+def test_what_a_mask_leaves_out_is_neither_sharp_nor_blurred(folder):
+    mask = np.full((180, 240), 255, np.uint8)
+    mask[40:140, 100:200] = 0
+    for hidden in (0, 255, np.random.default_rng(0).integers(0, 256, (180, 240, 3))):
+        image = np.where(mask[..., None] > 0, planes()[0], hidden).astype(np.uint8)
+        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        assert sharpness(grey, mask) == sharpness(cv2.cvtColor(planes()[0], cv2.COLOR_BGR2GRAY), mask)
 
 
 @pytest.mark.slow

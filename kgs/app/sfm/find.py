@@ -116,7 +116,7 @@ def _inner(folder: Path, masks: Path | None) -> list[str]:
     if like and not used and not masks_beside(folder):
         notes.append(f"called like masks and not used: {listed_files(like)}: {MASKS_ARE_IN}")
         inner = [path for path in inner if path not in like]
-    called = {path for path in inner if path.suffix.lower() in IMAGE_SUFFIXES}
+    called = {path for path in inner if path.suffix.lower() in (*IMAGE_SUFFIXES, *UNREADABLE_SUFFIXES)}
     if deeper := [path for path in inner if path in called or (_holds_photos(path) and not is_own(path))]:
         notes.append(f"not looked into, because they are folders: {listed_files(deeper)}")
     return notes

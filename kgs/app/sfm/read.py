@@ -37,6 +37,7 @@ _UNITS = {2: 25.4, 3: 10.0, 4: 1.0}  # mm, in which the density of pixels is giv
 _PANORAMA = b"equirectangular"  # in XMP, https://developers.google.com/streetview/spherical-metadata
 _SEAM = 2.0  # how much more than neighbouring columns the first and the last one of a panorama may differ
 _SAME_ZOOM = 1.1  # largest ratio of focal lengths that counts as one lens without zoom
+_KERNEL = 33  # pixels of the smoothing, four standard deviations to each side
 _BLURRED = 0.5  # a photo below this share of the median sharpness is blurred
 
 
@@ -305,7 +306,7 @@ def _kept(photo: OpenPhoto) -> Image | None:
 
 def blurred(photos: list[Photo]) -> list[Photo]:
     """Photos that have far less fine detail than the others of the same lens."""
-    values = [sharpness(photo.grey()) for photo in photos]
+    values = [sharpness(photo.grey(), photo.mask) for photo in photos]
     of_lens = defaultdict[int, list[float]](list)
     for photo, value in zip(photos, values, strict=True):
         of_lens[photo.lens].append(value)
@@ -313,10 +314,19 @@ def blurred(photos: list[Photo]) -> list[Photo]:
     return [photo for photo, value in zip(photos, values, strict=True) if value < _BLURRED * usual[photo.lens]]
 
 
-def sharpness(grey: NDArray[np.uint8]) -> float:
-    """How much of the contrast is fine: standard deviation of the Laplacian over that of the smoothed brightness."""
+def sharpness(grey: NDArray[np.uint8], mask: NDArray[np.uint8] | None = None) -> float:
+    """How much of the contrast is fine: standard deviation of the Laplacian over that of the smoothed brightness.
+
+    With a mask, where no pixel that it leaves out has a part in the means.
+    """
     values = grey.astype(np.float32)
-    return float(cv2.Laplacian(values, cv2.CV_32F).std() / (cv2.GaussianBlur(values, (0, 0), 4.0).std() + 1.0))
+    fine = cv2.Laplacian(values, cv2.CV_32F)
+    smooth = cv2.GaussianBlur(values, (_KERNEL, _KERNEL), 4.0)
+    if mask is not None:
+        inner = cv2.erode(mask, np.ones((_KERNEL, _KERNEL), np.uint8)) > 0
+        if inner.any():
+            fine, smooth = fine[inner], smooth[inner]
+    return float(fine.std() / (smooth.std() + 1.0))
 
 
 def by_shape(photos: list[OpenPhoto]) -> dict[str, list[OpenPhoto]]:
