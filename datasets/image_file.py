@@ -66,6 +66,7 @@ _MULTIPLIED_ALPHA = 1  # a value of `_EXTRA_SAMPLES`
 _ALPHA = 2  # likewise
 _WHITE_IS_ZERO = 0  # a value of `_COLORS`
 _CMYK = 5  # likewise
+_UNSPECIFIED = (2, 2)  # primaries and curve in nclx
 _IS_SRGB = 1  # a value of `_COLOR_SPACE`
 _IS_ADOBE_RGB = 2  # likewise, of some cameras
 _IS_OTHER = 65535  # likewise
@@ -288,7 +289,8 @@ def _profile(kind: str, image: Opened, file: IO[bytes], chunks: dict[bytes, byte
         places = image.info.get("chromaticity") or (*Colors().white, *sum(Colors().primaries, ()))
         exponent = image.info.get("gamma")
         return Colors.of(places[:2], places[2:], 1 / exponent if exponent else None) or b""
-    if nclx := image.info.get("nclx_profile"):
+    nclx = image.info.get("nclx_profile")
+    if nclx and (nclx["color_primaries"], nclx["transfer_characteristics"]) != _UNSPECIFIED:
         return colors_of(nclx["color_primaries"], nclx["transfer_characteristics"])
     space = tags.get(_COLOR_SPACE)
     if space == _IS_SRGB:

@@ -81,7 +81,7 @@ def load_scene(
         photo_folder: where a scene (LLFF, COLMAP) has its photos in several sizes, the name of the folder to take, as
             "images_8"; "": that of the largest, `images` first. See also :func:`kgs.datasets.field.field_size`.
         masks: a folder with masks of the photos, which have their stems; white is kept. None: those that the layout's
-            files name, or those in `masks/`, and `dynamic_mask_*.png` beside the photos.
+            files name, or those in `masks/`, and those beside the photos (`IMG_1_mask.png`, `dynamic_mask_IMG_1.png`).
         mask_means: what black in a mask means. "away": such pixels are ignored (somebody walked by), see
             `Views.counted`. "absent": nothing is there, as where an image is transparent.
 

@@ -81,6 +81,11 @@ def test_colours_are_those_that_its_numbers_say(folder):
         np.testing.assert_allclose(found, expected, atol=2e-3)
 
 
+def test_numbers_that_say_nothing_change_nothing(folder):
+    (folder / "IMG_2.HEIC").write_bytes(with_nclx(2, 2))
+    np.testing.assert_array_equal(ImageFile(folder / "IMG_2.HEIC").read(), ImageFile(folder / "IMG_1.heic").read())
+
+
 @pytest.mark.parametrize(("curve", "name"), [(16, "PQ"), (18, "HLG")])
 def test_hdr_is_refused(folder, curve, name):
     (folder / "IMG_2.HEIC").write_bytes(with_nclx(9, curve))
