@@ -19,6 +19,7 @@ from kgs.app.files.outputs import write_png
 from kgs.app.files.publishing import publish, replacing
 from kgs.app.sfm import pose, pose_photos
 from kgs.app.sfm.find import find_photos, notes_on
+from kgs.app.sfm.pycolmap_processes import PycolmapProcesses
 from kgs.app.sfm.read import blurred, open_photos, read_photos, sharpness
 from kgs.datasets.masks import mask_folder
 from kgs.errors import DataError
@@ -449,11 +450,12 @@ def test_ctrl_c_while_keypoints_are_matched(folder, tmp_path):
 def test_neither_solver_sees_what_alpha_hides(folder, tmp_path, monkeypatch):
     shown = []
 
-    def look(process, step, database, images="", names=(), **_):
+    def look(process, step, database, images="", lenses=(), **_):
+        names = sorted(name for of_lens, _ in lenses for name in of_lens)
         shown.extend(cv2.imread(f"{images}/{name}", cv2.IMREAD_UNCHANGED) for name in names)
         raise RuntimeError("that is enough")
 
-    monkeypatch.setattr(pose.PycolmapProcesses, "run", look)
+    monkeypatch.setattr(PycolmapProcesses, "run", look)
     images = planes()
     alpha = np.full((*images.shape[:3], 1), 255, np.uint8)
     alpha[:, :60] = 0
