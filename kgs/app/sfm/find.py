@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from kgs.app.files.ownership import is_own
+from kgs.app.files.publishing import read_marker
 from kgs.datasets import folders
 from kgs.datasets.folders import (
     HEIC_SUFFIXES,
@@ -117,7 +117,7 @@ def _inner(folder: Path, masks: Path | None) -> list[str]:
         notes.append(f"called like masks and not used: {listed_files(like)}: {MASKS_ARE_IN}")
         inner = [path for path in inner if path not in like]
     called = {path for path in inner if path.suffix.lower() in (*IMAGE_SUFFIXES, *UNREADABLE_SUFFIXES)}
-    if deeper := [path for path in inner if path in called or (_holds_photos(path) and not is_own(path))]:
+    if deeper := [path for path in inner if path in called or (_holds_photos(path) and not read_marker(path))]:
         notes.append(f"not looked into, because they are folders: {listed_files(deeper)}")
     return notes
 
