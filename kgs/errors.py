@@ -1,5 +1,7 @@
-"""Errors beside wrong arguments: a bad file, and a fit whose numbers are no longer finite."""
+"""Errors beside wrong arguments: a bad file, and a fit whose numbers are no longer finite; and warnings."""
 
+import inspect
+import warnings
 from collections.abc import Sequence
 from os import PathLike
 
@@ -14,6 +16,13 @@ def listed(names: Sequence[object], most: int = 3) -> str:
     more = len(names) - most
     text = ", ".join(printable(name) for name in names[:most])
     return f"{text} and {more} more" if more > 0 else text
+
+
+def warn(message: str, category: type[Warning] = UserWarning) -> None:
+    """Warn at the line that called kgs: the innermost one that is neither in kgs nor in torch."""
+    names = [call.frame.f_globals.get("__name__", "") for call in inspect.stack(context=0)]
+    outside = [not f"{name}.".startswith(("torch.", "kgs.")) for name in [*names, ""]]
+    warnings.warn(message, category, stacklevel=outside.index(True) + 1)
 
 
 class DataError(Exception):

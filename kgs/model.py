@@ -1,7 +1,8 @@
 """The model: the parameters of a splat, which an optimiser changes, and their activations to Gaussians.
 
 Source: B. Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering", SIGGRAPH 2023, section 5:
-exponential for scales, sigmoid for opacities, isotropic start with the mean distance to the three nearest points.
+exponential for scales, sigmoid for opacities, isotropic start with the root mean squared distance to the three nearest
+points (the release's: the paper says mean distance).
 """
 
 import math

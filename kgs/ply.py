@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kgs.errors import DataError
+from kgs.errors import DataError, warn
 from kgs.json_files import write_whole
 from kgs.model import MAX_SH_DEGREE, GaussianModel
 from kgs.types import SH_SIZES, check_kind
@@ -143,15 +143,14 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
         table = np.stack([*means.astype(np.float32).T, *others], axis=1)
     kept = _rows_of_gaussians(path, table, names)
     if not kept.all():
-        warnings.warn(f"{path}: {_count_left_out(table, kept)}", stacklevel=2)
+        warn(f"{path}: {_count_left_out(table, kept)}")
         table = table[kept]
         means = means[kept]
     parts = torch.from_numpy(table).split([3, 3, rest, 1, 3, 4], dim=1)
     means32, sh_dc, sh_rest, opacity_logits, log_scales, quats = parts
     if float32_moves(means, log_scales.numpy()):
         centre = ", ".join(f"{value:.0f}" for value in np.median(means, axis=0))
-        message = f"{path}: float32 moves its Gaussians; pass an origin= near them, ({centre})"
-        warnings.warn(message, Float32Warning, stacklevel=2)
+        warn(f"{path}: float32 moves its Gaussians; pass an origin= near them, ({centre})", Float32Warning)
     return GaussianModel(
         means32,
         quats,

@@ -2,7 +2,8 @@
 
     "torch"   every call (`kgs.backends.torch`)
     "numba"   float32 on a CPU (`kgs.backends.cpu`, extra "fast")
-    "triton"  float32 on a GPU (`kgs.backends.gpu`; torch brings Triton on Linux)
+    "triton"  float32 on GPUs that torch calls "cuda" (NVIDIA, AMD) or "xpu" (`kgs.backends.gpu`; torch brings Triton on
+              Linux); on others, as "mps", torch is the only one
 
 A backend is a class that names its stages, see :class:`Backend`; a new one is a folder, and a line in `BACKENDS`.
 """
@@ -50,7 +51,9 @@ def resolve(name: str, device: Device) -> str:
         if backend.runs_on(device) and backend.is_installed() and _may_take(backend, name, device):
             return backend.name
     devices = next(" and ".join(backend.devices or ()) for backend in BACKENDS if backend.name == name)
-    raise ValueError(f'backend: expected "auto" or "torch" on {device}, got "{name}", which runs on {devices} alone')
+    others = "".join(f'; "{x.name}" runs on {device}, too' for x in BACKENDS if x.devices and x.runs_on(device))
+    reason = f"which runs on {devices} alone{others}"
+    raise ValueError(f'backend: expected "auto" or "torch" on {device}, got "{name}", {reason}')
 
 
 def former_or_auto(name: str, device: Device) -> str:

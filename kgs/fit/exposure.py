@@ -13,7 +13,6 @@ it rises after an affine fit of colours; and shading, reflections and noise give
 gains are used only where photos differ much, and gains explain it (docs/photos.md has measurements).
 """
 
-import warnings
 from dataclasses import replace
 from typing import Any
 
@@ -21,6 +20,7 @@ import torch
 from torch import Tensor
 
 from kgs.datasets.scene import Scene
+from kgs.errors import warn
 from kgs.init_points import InitialPoints
 from kgs.init_points.patches import MIN_PATCHES, PatchColors
 
@@ -50,10 +50,7 @@ def decide_exposure(plan: Plan, points: InitialPoints) -> Plan:
         return plan
     if points.patches is None or len(points.patches) < MIN_PATCHES:
         if how == "each":
-            warnings.warn(
-                "exposure: the initial points come without patches of colour, so photos are taken as equally exposed",
-                stacklevel=2,
-            )
+            warn("exposure: the initial points come without patches of colour, so photos are taken as equally exposed")
         return plan
     gains, left = estimate_gains(points.patches)
     ratio = float((gains.amax(0) / gains.amin(0)).max())

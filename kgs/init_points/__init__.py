@@ -1,6 +1,5 @@
 """Makes the initial points of a fit, from the training views only: test views are never used here."""
 
-import warnings
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -9,6 +8,7 @@ import torch
 from torch import Tensor
 
 from kgs.datasets.scene import Views
+from kgs.errors import warn
 from kgs.geometry import ViewGeometry
 from kgs.progress import ProgressBar, silent
 from kgs.types import check_kind
@@ -112,14 +112,14 @@ def initial_points(
         message = (
             f"initial points: {len(views)} training views agree on {dense.agreed} points only; SIFT points instead"
         )
-        warnings.warn(message, stacklevel=2)
+        warn(message)
     count = FEWEST if count is None else count
     if kind in ("dense", "sift"):
         if len(tracked) >= MIN_SIFT:
             colors = _mean_colors(views.images, tracked.tracks.pixels, tracked.tracks.visible)
             return InitialPoints(tracked.points.float(), colors, "sift")
         message = f"initial points: SIFT found {len(tracked)} in {len(views)} training views, fewer than {MIN_SIFT}; "
-        warnings.warn(f"{message}the fit starts from {count} random points instead", stacklevel=2)
+        warn(f"{message}the fit starts from {count} random points instead")
     near, far = depth_range(tracked, geometry)
     points = _random_points(geometry, count, near, far, generator)
     places, depths = geometry.project(points)

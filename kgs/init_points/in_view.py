@@ -1,12 +1,11 @@
 """Checks that initial points lie where the training views look: a fit from other points renders nothing."""
 
-import warnings
 from os import PathLike
 
 from torch import Tensor
 
 from kgs.datasets.scene import Views
-from kgs.errors import DataError, listed
+from kgs.errors import DataError, listed, warn
 from kgs.geometry import points_in_images
 
 
@@ -30,4 +29,4 @@ def check_in_view(points: Tensor, views: Views, path: str | PathLike[str]) -> No
     has_points = inside.any(dim=0).tolist()
     empty = [name for name, has_some in zip(views.names, has_points, strict=True) if not has_some]
     if empty:
-        warnings.warn(f"initial points: none lies in the image of {listed(empty)}", stacklevel=3)
+        warn(f"initial points: none lies in the image of {listed(empty)}")

@@ -1,16 +1,21 @@
 """DropGaussian against `torch.nn.Dropout`: what it does to values and gradients, its rates and its warnings."""
 
+import copy
+import importlib
 import math
+import pickle
 import warnings
+from pathlib import Path
 
 import pytest
 import torch
 from factories import drop_layer as at
-from factories import other_defaults
+from factories import other_defaults, random_camera, random_gaussians
 from factories import random_opacities as draw
 from torch import nn
 
-from kgs import DropGaussian, drop_gaussian
+import kgs.drop as drop_module
+from kgs import DropGaussian, GaussianRenderer, drop_gaussian
 
 CPU = {"device": "cpu", "dtype": torch.float32}
 # -- nn.Dropout's semantics ----------------------------------------------------------------------------------------
@@ -126,12 +131,30 @@ def test_the_rate_is_p_times_the_schedule(schedule, rates):
         assert abs(dropped - rate) <= 5 * math.sqrt(rate * (1 - rate) / 100_000)
 
 
-@pytest.mark.parametrize("progress", [-1e-9, 1.0000001, 2, math.nan, math.inf, "0.5", None])
+@pytest.mark.parametrize("progress", [-1e-9, 1.000002, 2, math.nan, math.inf, "0.5", None])
 def test_progress_outside_zero_to_one_is_refused_and_the_old_one_stays(progress):
     layer = at(0.5)
     with pytest.raises(ValueError, match="progress"):
         layer.progress = progress
     assert layer.progress == 0.5
+
+
+@pytest.mark.parametrize("steps", [9, 10, 11, 2999])
+def test_progress_that_is_added_up_ends_at_one(steps):
+    layer = at(0.0, p=0.5)
+    for _ in range(steps):
+        layer.progress += 1 / steps
+    assert layer.progress == pytest.approx(1.0, abs=1e-9)
+    assert layer.rate <= 0.5
+    layer.progress = 1.000001
+    assert layer.progress == 1.0
+
+
+def test_a_schedule_that_ends_below_zero_by_rounding_ends_at_zero():
+    layer = at(1.0, p=0.5, schedule=lambda progress: 0.3 - 0.1 * 3 * progress)
+    x = draw()
+    assert layer.rate == 0.0
+    assert layer(x) is x
 
 
 def test_values_are_read_in_the_first_call_alone():
@@ -164,10 +187,50 @@ def test_nothing_is_warned_about_when_nothing_is_amiss(layer):
         layer(draw())
 
 
-def test_the_warning_points_at_the_calling_line():
+def hooked(layer):
+    layer.register_forward_pre_hook(lambda module, args: None)
+    layer.register_forward_hook(lambda module, args, output: None)
+    return layer
+
+
+@pytest.mark.parametrize(
+    "wrapped",
+    [
+        lambda layer: layer,
+        hooked,
+        lambda layer: nn.Sequential(nn.Identity(), layer),
+        lambda layer: nn.DataParallel(layer),  # without a GPU it calls its module
+        lambda layer: torch.no_grad()(layer),
+        lambda layer: torch.compile(layer, backend="eager"),
+    ],
+    ids=["layer", "hooked", "sequential", "parallel", "no_grad", "compiled"],
+)
+def test_the_warning_points_at_the_calling_line(wrapped):
+    torch._dynamo.reset()
+    call = wrapped(DropGaussian())
     with pytest.warns(UserWarning, match="never set") as caught:
-        DropGaussian()(draw())
+        call(draw())
+    (warning,) = [each for each in caught if "never set" in str(each.message)]
+    assert warning.filename == __file__
+    assert "call(draw())" in Path(__file__).read_text().splitlines()[warning.lineno - 1]
+
+
+def test_the_warning_of_a_layer_in_the_renderer_points_at_the_line_that_renders():
+    renderer = GaussianRenderer(DropGaussian())
+    gaussians, camera = random_gaussians(4, 0, torch.float32), random_camera(8, 8, 0, torch.float32)
+    with pytest.warns(UserWarning, match="never set") as caught:
+        renderer(gaussians, camera)
     assert caught[0].filename == __file__
+
+
+def test_the_warning_of_a_copied_file_points_at_the_calling_line(tmp_path, monkeypatch):
+    (tmp_path / "copied_drop.py").write_text(Path(drop_module.__file__).read_text())
+    (tmp_path / "copied_drop_user.py").write_text("def use(layer, x):\n    return layer(x)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    copied, user = map(importlib.import_module, ("copied_drop", "copied_drop_user"))
+    with pytest.warns(UserWarning, match="never set") as caught:
+        user.use(hooked(copied.DropGaussian()), draw())
+    assert (caught[0].filename, caught[0].lineno) == (user.__file__, 2)
 
 
 @pytest.mark.parametrize("seed", [None, 3])
@@ -195,3 +258,158 @@ def test_repr_says_what_will_happen():
         == "DropGaussian(p=0.1, schedule=constant, progress=0.5, seed=3)"
     )
     assert "schedule=sqrt," in repr(DropGaussian(schedule=math.sqrt))
+    assert repr(at(0.5, scale=False)).endswith("progress=0.5, scale=False)")
+    assert repr(at(0.5, p=torch.zeros(5))).startswith("DropGaussian(p=tensor of shape (5,), schedule=linear, progress")
+
+
+# -- a rate for each Gaussian --------------------------------------------------------------------------------------
+
+RATES = torch.tensor([0.0, 0.1, 0.5, 0.9])
+
+
+@pytest.mark.parametrize("seed", [None, 3])
+@pytest.mark.parametrize("kind", [torch.float16, torch.float32, torch.float64])
+@pytest.mark.parametrize("scale", [True, False])
+@pytest.mark.parametrize("shape", [(4,), (4, 1), (50_000, 4)])
+def test_each_gaussian_has_its_rate(shape, scale, kind, seed):
+    """The share of dropped ones, the mean over masks, and the exact value of those that are kept."""
+    layer = at(1.0, p=RATES.to(kind), seed=seed, scale=scale)
+    torch.manual_seed(0)
+    values = torch.tensor([0.2, 0.4, 0.6, 0.8], dtype=torch.float64)
+    x = (values[:, None] if shape == (4, 1) else values.expand(shape)).clone().requires_grad_()
+    out = layer(x)
+    assert (out.shape, out.dtype) == (x.shape, x.dtype)
+    factors = 1 / (1 - RATES.to(kind).double()) if scale else torch.ones(4, dtype=torch.float64)
+    expected = torch.where(out == 0, 0.0, x * (factors[:, None] if shape == (4, 1) else factors))
+    torch.testing.assert_close(out, expected, rtol=1e-14, atol=0.0)
+    out.sum().backward()
+    torch.testing.assert_close(x.grad, out.detach() / x.detach(), rtol=1e-14, atol=0.0)
+    if shape == (50_000, 4):
+        rates = RATES.to(kind).double()
+        share = (out == 0).double().mean(0)
+        assert (share - rates).abs().le(5 * (rates * (1 - rates) / 50_000).sqrt()).all()
+        mean = values if scale else values * (1 - rates)
+        bound = 5 * values * factors * (rates * (1 - rates) / 50_000).sqrt()
+        assert (out.mean(0) - mean).abs().le(bound + 1e-12).all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32])
+def test_rates_leave_the_dtype_and_their_schedule_is_that_of_a_number(dtype):
+    x = torch.full((4,), 0.5, dtype=dtype)
+    assert drop_gaussian(x, RATES).dtype == dtype
+    layer = at(0.5, p=RATES)
+    torch.testing.assert_close(layer.rate, RATES / 2)
+    layer.p = torch.tensor([0.0, 0.0])
+    assert torch.equal(layer(torch.tensor([0.3, 0.4])), torch.tensor([0.3, 0.4]))
+    assert torch.equal(drop_gaussian(x, torch.zeros(4, dtype=torch.int64)), x)
+    assert drop_gaussian(torch.empty(0), torch.empty(0)).shape == (0,)
+
+
+def test_rates_get_no_gradient_and_one_rate_alone_is_a_number():
+    rates = nn.Parameter(RATES.clone())
+    layer = DropGaussian(rates, "constant")
+    assert layer.state_dict() == {}
+    assert list(layer.parameters()) == []
+    x = torch.full((4,), 0.5, requires_grad=True)
+    layer(x).sum().backward()
+    assert rates.grad is None
+    assert at(1.0, p=torch.tensor([0.25])).rate == 0.25
+    assert at(1.0, p=torch.tensor(0.25)).rate == 0.25
+
+
+@pytest.mark.parametrize("shape", [(2, 4), (4, 1)])
+def test_a_rate_for_each_opacity(shape):
+    rates = torch.rand(shape, generator=torch.Generator().manual_seed(0))
+    out = at(1.0, p=rates)(torch.ones(shape))
+    torch.testing.assert_close(out, torch.where(out == 0, 0.0, 1 / (1 - rates)))
+
+
+@pytest.mark.parametrize("rates", [[0.5, 1.0], [-0.1, 0.5], [0.5, math.nan]])
+def test_rates_outside_zero_to_one_are_refused(rates):
+    for call in (
+        lambda: DropGaussian(torch.tensor(rates)),
+        lambda: drop_gaussian(torch.ones(2), torch.tensor(rates)),
+        lambda: drop_gaussian(torch.ones(2), torch.tensor(rates), training=False),
+    ):
+        with pytest.raises(ValueError, match=r"p: expected .* in \[0, 1\)"):
+            call()
+    layer = at(1.0)
+    layer.p = torch.tensor(rates)
+    with pytest.raises(ValueError, match="p \\* schedule"):
+        layer(torch.ones(2))
+
+
+@pytest.mark.parametrize(("shape", "rates"), [((5,), 4), ((3, 5), 3), ((5, 1), 4), ((), 4), ((5, 4, 1), 5)])
+def test_rates_of_another_number_of_gaussians_are_refused(shape, rates):
+    with pytest.raises(ValueError, match="p: expected a rate for each"):
+        drop_gaussian(torch.ones(shape), torch.full((rates,), 0.5))
+
+
+# -- no compensation, and the factors of the last call -------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [None, 3])
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64])
+def test_without_compensation_the_masks_are_the_same_and_kept_ones_exact(dtype, seed):
+    x = torch.rand(1000, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    x = (0.01 + 0.9 * x).to(dtype)
+    outputs = []
+    for scale in (True, False):
+        torch.manual_seed(5)
+        outputs.append(at(1.0, p=0.3, seed=seed, scale=scale)(x))
+    assert torch.equal(outputs[1], x * (outputs[0] != 0))
+    assert 200 < (outputs[1] == 0).sum() < 400
+    torch.manual_seed(5)
+    found = drop_gaussian(x, 0.3, scale=False)
+    torch.manual_seed(5)
+    assert torch.equal(found, x * (nn.functional.dropout(x, 0.3) != 0))
+
+
+@pytest.mark.parametrize("p", [0.0, 0.3, RATES])
+@pytest.mark.parametrize("scale", [True, False])
+@pytest.mark.parametrize("seed", [None, 3])
+@pytest.mark.parametrize("shape", [(4,), (4, 1), (3, 4)])
+def test_the_factors_of_the_last_call_are_those_of_its_opacities(shape, seed, scale, p):
+    layer = at(1.0, p=p, seed=seed, scale=scale)
+    assert layer.last_scale is None
+    x = draw(math.prod(shape)).reshape(shape).requires_grad_()
+    out = layer(x)
+    factors = layer.last_scale
+    assert (factors.shape, factors.dtype, factors.requires_grad) == (x.shape, x.dtype, False)
+    assert torch.equal(out, x * factors)
+    (gradient,) = torch.autograd.grad(out.sum(), x)
+    assert torch.equal(gradient, factors)
+    again = layer(x)
+    assert torch.equal(again, x * layer.last_scale)
+
+
+def test_in_eval_there_are_no_factors_and_those_of_training_stay():
+    layer, x = at(1.0, p=0.5), draw()
+    layer.eval()(x)
+    assert layer.last_scale is None
+    out = layer.train()(x)
+    layer.eval()(x)
+    assert layer.last_scale is None
+    assert torch.equal(layer.train().last_scale * x, out)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda layer: pickle.loads(pickle.dumps(layer))])
+def test_copies_have_the_rates_and_no_factors(copied):
+    layer = at(1.0, p=RATES, scale=False, seed=3)
+    layer(torch.ones(4))
+    twin = copied(layer)
+    assert twin.last_scale is None
+    assert layer.last_scale is not None
+    assert twin.scale is False
+    assert torch.equal(twin.rate, RATES)
+    assert twin.state_dict() == {}
+    assert torch.equal(twin(torch.ones(4)), layer(torch.ones(4)))
+    assert len(pickle.dumps(at(1.0))) < 10_000
+
+
+def test_replicas_of_data_parallel_drop_and_leave_the_layer_alone():
+    layer = at(1.0, p=RATES)
+    replica = layer._replicate_for_data_parallel()
+    replica(torch.ones(4))
+    assert replica.last_scale is not None
+    assert layer.last_scale is None

@@ -69,8 +69,8 @@ def test_names_are_loaded_when_they_are_asked_for():
 
 # name -> its first parameters in order, with their defaults. What README and notebooks rely on
 SIGNATURES = {
-    "kgs.DropGaussian": "p=0.2, schedule='linear', seed=None",
-    "kgs.drop_gaussian": "opacities, p=0.2, training=True, generator=None",
+    "kgs.DropGaussian": "p=0.2, schedule='linear', seed=None, device='cpu', scale=True",
+    "kgs.drop_gaussian": "opacities, p=0.2, training=True, generator=None, scale=True",
     "kgs.GaussianRenderer": "opacity_layer=None, options=None, backend='auto'",
     "kgs.GaussianRenderer.forward": "self, gaussians, cameras, background=None, outputs=('image',)",
     "kgs.RasterOptions": """

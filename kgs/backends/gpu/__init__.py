@@ -19,11 +19,11 @@ Rules:
 
 import functools
 import os
-import warnings
 
 import torch
 
 from kgs.backends.base import Backend, CompositingCall, Compositor, LossStage, ProjectionStage
+from kgs.errors import warn
 
 
 class GpuBackend(Backend):
@@ -102,5 +102,5 @@ def self_check(device: torch.device) -> bool:
         if difference <= BOUND:
             return True
         reason = f"they differ from torch by {difference:.1e}, more than {BOUND:g}"
-    warnings.warn(f"kgs: Triton's kernels are not used on {device}, torch is: {reason}", stacklevel=2)
+    warn(f"kgs: Triton's kernels are not used on {device}, torch is: {reason}")
     return False
