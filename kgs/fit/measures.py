@@ -10,6 +10,7 @@ from kgs.metrics.lpips import Lpips
 from .fit import Fit
 
 _INIT_NOTES = {
+    **dict.fromkeys(("dense", "sift", "random"), "initial points from training views alone"),
     "model-points": "points seen in training views, but their positions were refined with test views",
     "scene": "initial points that come with the layout",
     "file": "initial points of a file",
@@ -20,6 +21,16 @@ _CONVENTIONS = {
     "lpips": "VGG16 v0.1, inputs in [-1, 1]; lpips_vgg_unscaled with inputs in [0, 1] as the published tables",
     "test_views_used_for": "metrics and the curve only; no early stopping",
 }
+
+
+def used_init(asked: str, kind: str) -> str:
+    """The kind of initial points that a fit began with, in the words of `FitConfig.init`.
+
+    Args:
+        asked: the entry `init`.
+        kind: `InitialPoints.kind` of the points; those of the layout for "scene" are "random", too.
+    """
+    return asked if (asked, kind) == ("scene", "random") else kind
 
 
 def measure(fit: Fit, lpips: Lpips | None = None) -> dict[str, Any]:
@@ -42,7 +53,10 @@ def measure(fit: Fit, lpips: Lpips | None = None) -> dict[str, Any]:
         raise ValueError("fit: expected a fit of kgs, which has settings, got a splat alone")
     if not fit.history:
         raise ValueError("fit: expected one that was just made, got one that was read from its folder: it has metrics")
-    init_note = _INIT_NOTES.get(config.init, "initial points from training views alone")
+    init = used_init(config.init, fit.history["init"]["kind"])
+    init_note = _INIT_NOTES.get(init, "initial points that were given")
+    if config.init in ("dense", "sift") and init in ("sift", "random") and init != config.init:
+        init_note += f" ({config.init} was asked for, and found too few)"
     poses = "poses as given (estimated with all views in real scenes, the field's protocol)"
     if fit.history["poses"] is not None:
         poses += ", those of the training views refined by the fit"
@@ -65,7 +79,7 @@ def measure(fit: Fit, lpips: Lpips | None = None) -> dict[str, Any]:
             "test": list(scene.test.names),
             "image_size": list(scene.train.images.shape[-2:]),
             "background": scene.background.tolist(),
-            "init": f"{config.init}: {init_note}; {poses}",
+            "init": f"{init}: {init_note}; {poses}",
             "psnr": f"mean over views, renders clamped to [0, 1], all channels, {pixels}",
             **_CONVENTIONS,
         },

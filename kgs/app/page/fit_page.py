@@ -21,6 +21,7 @@ from kgs.datasets.scene import Scene, Views
 from kgs.datasets.splits import select_evenly
 from kgs.errors import DataError
 from kgs.fit.fit import Fit
+from kgs.fit.measures import used_init
 from kgs.fit.prune import contributions, left_out
 from kgs.json_files import read_json
 from kgs.types import Gaussians
@@ -107,7 +108,7 @@ def write_fit_page(
             runs=runs,
             notes=notes,
             remarks=[*_remarks(runs), *remarks],
-            settings=_settings(settings or {}),
+            settings=_settings(settings or {}, fit.metrics),
             report=_report_facts(_read_report(report)),
             left_out=left_out(first_run.get("needs") or {}),
         ),
@@ -240,10 +241,18 @@ def _ground(views: Views, background: Tensor) -> Tensor:
     return ground
 
 
-def _settings(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The content of config.json in one dict, without the timetable of steps."""
+def _settings(config: Mapping[str, Any], metrics: Mapping[str, Any]) -> dict[str, Any]:
+    """The content of config.json in one dict, without the timetable of steps.
+
+    Where metrics.json says what was used in place of what was asked for, it is that.
+    """
     rest = {name: value for name, value in config.items() if name not in ("request", "fit", "timetable")}
-    return {**config.get("request", {}), **config.get("fit", {}), **rest}
+    values = {**config.get("request", {}), **config.get("fit", {}), **rest}
+    with suppress(KeyError, TypeError):
+        values["init"] = used_init(values["init"], metrics["init"]["kind"])
+    if "backend" in values:
+        values["backend"] = metrics.get("backend", values["backend"])
+    return values
 
 
 def _report_facts(content: Mapping[str, Any]) -> dict[str, Any]:
