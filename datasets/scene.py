@@ -1,7 +1,7 @@
 """A scene as every loader returns it: posed training and test images in one frame."""
 
 import operator
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self, SupportsIndex
@@ -150,22 +150,29 @@ class Views:
             gains=gains,
         )
 
-    def as_photo(self, index: int, render: Tensor) -> Tensor:
-        """A render `(..., 3, H, W)` as the photo of one view would show it.
+    def render(self, index: int, render: Callable[..., Tensor]) -> Tensor:
+        """The render of one view in the exposure of its photo, `(1, 3, H, W)`.
 
-        Its colours are multiplied by the gains of the view and clamped to [0, 1], behind the photos' dark border. Where
-        there are gains the background should be black: it is multiplied, too.
+        `render` is called with the camera and, where there are gains, with those of the view, `(3,)`: it multiplies the
+        colours of the scene by them, and not the background that shows through, which no photo exposes.
         """
-        image = render if self.gains is None else render * self.gains[index, :, None, None].to(render)
+        camera = self.camera(index)
+        return render(camera) if self.gains is None else render(camera, self.gains[index])
+
+    def as_photo(self, index: int, image: Tensor) -> Tensor:
+        """What :meth:`render` returned, `(..., 3, H, W)`, as the photo would show it.
+
+        It is clamped to [0, 1], behind the photos' dark border.
+        """
         image = image.clamp(0, 1)
         return image if self.transmittance is None else image * self.transmittance.to(image)
 
-    def compared(self, index: int, render: Tensor) -> tuple[Tensor, Tensor, float]:
-        """A render `(..., 3, H, W)` as the photo of one view would show it, that photo, and the share that counts.
+    def compared(self, index: int, image: Tensor) -> tuple[Tensor, Tensor, float]:
+        """What :meth:`render` returned as the photo would show it, that photo, and the share of pixels that counts.
 
-        Both are black where pixels do not count. The photo is `(3, H, W)`, on the device and of the type of the render.
+        Both are black where pixels do not count. The photo is `(3, H, W)`, on the device and of the type of the image.
         """
-        image = self.as_photo(index, render)
+        image = self.as_photo(index, image)
         photo = self.images[index].to(image)
         if self.counted is None:
             return image, photo, 1.0

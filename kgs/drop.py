@@ -27,16 +27,17 @@ def drop_gaussian(
     """Set each opacity to 0 with probability p and multiply the others by 1/(1 - p).
 
     This is `torch.nn.functional.dropout` of activated opacities (never of logits: a logit of 0 is an opacity of 0.5).
-    The result may exceed 1; it must not be clamped, the rasteriser clamps alpha for each pixel. It is `opacities`
-    itself if p is the number 0, or not training.
+    The result may exceed 1; it must not be clamped, the rasteriser clamps alpha for each pixel.
 
     Args:
-        opacities: `(N,)` for one mask of all cameras, `(C, N)` for one per camera, or another shape; floating point.
-        p: the drop rate, in [0, 1); or a rate for each Gaussian, `(N,)`, of opacities `(N,)`, `(N, 1)` or `(C, N)`; or
-            for each opacity, in their shape. No gradient reaches it.
+        opacities: floating point, `(N,)` or `(N, 1)` for all cameras, `(C, N)` to drop others in each, or any shape.
+        p: the drop rate, in [0, 1), or a rate for each Gaussian, `(N,)`, or for each opacity; without gradient.
         training: if False, nothing is dropped.
         generator: draws the mask on its own device, whatever that of `opacities`; None uses torch's default one.
         scale: if False, the others keep their values, so that the mean over all masks is 1 - p times the opacity.
+
+    Returns:
+        A tensor like `opacities`; the same object if nothing is dropped (p is the number 0, or not training).
 
     Raises:
         TypeError: `opacities` is not a floating point tensor.
@@ -117,8 +118,7 @@ class DropGaussian(nn.Module):
         """Drop and rescale in `train()`, return `opacities` itself in `eval()`. See :func:`drop_gaussian`."""
         if not self.training:
             return opacities
-        drop: Callable[[Tensor], Tensor] = self._drop
-        return (torch.compiler.disable(drop) if torch.compiler.is_compiling() else drop)(opacities)
+        return torch.compiler.disable(self._drop)(opacities) if torch.compiler.is_compiling() else self._drop(opacities)
 
     def _drop(self, opacities: Tensor) -> Tensor:
         dropped, self._last_scale = _dropped(opacities, self.rate, self._generator, self.scale)

@@ -274,7 +274,7 @@ def _write_results(fit: Fit, folder: Path, names: dict[str, str], request: Scene
     notes = write_exports(fit, folder, request.roll)
     (folder / "test").mkdir(exist_ok=True)
     for i, name in each(list(enumerate(scene.test.names)), "test pictures", "view"):
-        render = fit.render(scene.test.camera(i))[0]
+        render = scene.test.render(i, fit.render)[0]
         write_png(folder / "test" / names[name], as_taken(scene.test.as_photo(i, render), scene.test, i))
     metrics = measure(fit, lpips)
     write_json(folder / "metrics.json", metrics)

@@ -12,7 +12,7 @@ from kgs.camera import move_camera
 from kgs.datasets.scene import Scene, Views
 from kgs.metrics.evaluate import mean_psnr
 from kgs.model import GaussianModel
-from kgs.renderer import GaussianRenderer
+from kgs.renderer import GaussianRenderer, blend
 from kgs.torch_threads import threads_beside
 from kgs.types import RasterOptions
 
@@ -60,11 +60,21 @@ class Fit:
         return background_of(self.scene, self.device)
 
     @torch.no_grad()
-    def render(self, camera: PinholeCamera) -> Tensor:
-        """Render all Gaussians from one camera before the background of the scene, `(1, 3, H, W)`."""
+    def render(self, camera: PinholeCamera, gains: Tensor | None = None) -> Tensor:
+        """Render all Gaussians from one camera before the background of the scene, `(1, 3, H, W)`.
+
+        Args:
+            camera: on any device.
+            gains: the exposure of a photo, `(3,)`: factors of the Gaussians' colours, not of the background; None: 1.
+        """
+        camera = move_camera(camera, self.device)
         with threads_beside(self.backend):
-            image: Tensor = self._renderer(self.model(), move_camera(camera, self.device), self._background).image
-        return image
+            if gains is None:
+                image: Tensor = self._renderer(self.model(), camera, self._background).image
+                return image
+            rendering: Any = self._renderer(self.model(), camera, outputs=("image", "alpha"))
+        exposed = rendering.image * gains.to(rendering.image)[:, None, None]
+        return blend(exposed, 1.0 - rendering.alpha, self._background)
 
     @torch.no_grad()
     def median_depth(self, camera: PinholeCamera) -> Tensor:

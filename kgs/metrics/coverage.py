@@ -15,7 +15,7 @@ from torch import Tensor
 from kgs.datasets.scene import Scene
 from kgs.geometry import nearest_pixels, project_points, unproject
 
-RenderView = Callable[[PinholeCamera], Tensor]
+RenderView = Callable[..., Tensor]  # of a camera
 
 MIN_VIEWS = 2  # training views that show a point
 OCCLUDED = 1.05  # a point is hidden from a view if it is farther than this times the view's depth there
@@ -49,7 +49,7 @@ def measure_coverage(scene: Scene, render: RenderView, median_depth: RenderView)
     for view in range(len(test)):
         camera = test.camera(view)
         covered = views_that_show(median_depth(camera), camera, depths, train.cameras) >= MIN_VIEWS
-        image, photo, _ = test.compared(view, render(camera)[0].cpu())
+        image, photo, _ = test.compared(view, test.render(view, render)[0].cpu())
         errors = (image - photo).square().mean(dim=0)
         counted = torch.ones_like(covered) if test.counted is None else test.counted[view].cpu()
         shares.append(float(covered[counted].float().mean()) if counted.any() else 0.0)

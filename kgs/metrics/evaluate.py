@@ -12,11 +12,10 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 from statistics import fmean
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
-from kornia.geometry.camera import PinholeCamera
 from kornia.metrics import psnr, ssim
 from torch import Tensor
 
@@ -32,12 +31,16 @@ _WINDOW = 11
 
 @torch.no_grad()
 def evaluate(
-    render: Callable[[PinholeCamera], Tensor], views: Views, lpips: Lpips | None = None, *, recolor: bool = False
+    render: Callable[..., Tensor], views: Views, lpips: Lpips | None = None, *, recolor: bool = False
 ) -> dict[str, Any]:
     """Render each view from its camera, to `(1, 3, H, W)`, and compare it with its photo; no gradients are kept.
 
+    `render` is called with a camera. Where views have gains, or masks and `recolor`, it is also called with gains, as
+    :meth:`kgs.fit.Fit.render` takes them.
+
     With `recolor`, each channel of a render first gets the gain and the offset that fit it best to the photo: what
-    exposure and white balance of a held-out photo do is then not counted.
+    exposure and white balance of a held-out photo do is then not counted. Where masks let a background show through,
+    only the colours of the scene get them.
 
     Views have at least 6 x 6 pixels, 16 x 16 with `lpips`, a network on the device of the renders. A ValueError for a
     render that differs in shape from its photo or holds NaN or infinity.
@@ -52,7 +55,7 @@ def evaluate(
     rows = list[dict[str, Any]]()
     shares = list[float]()
     for index, name in enumerate(views.names):
-        image = render(views.camera(index))
+        image = views.render(index, render)
         target = views.images[index : index + 1]
         if image.shape != target.shape:
             raise ValueError(f"render: expected shape {tuple(target.shape)} for {name}, got {tuple(image.shape)}")
@@ -61,7 +64,12 @@ def evaluate(
         shown, photo, share = views.compared(index, image)
         if recolor:
             counted = None if views.counted is None else views.counted[index]
-            shown, _, _ = views.compared(index, recolored(image, shown, photo, counted))
+            through = None
+            if views.masks is not None:
+                through = Through(render(views.camera(index), torch.zeros(3)), views.masks[index].to(image))
+                if views.transmittance is not None:  # the border darkens the background, too
+                    counted = (views.transmittance >= 1) & (True if counted is None else counted)
+            shown, _, _ = views.compared(index, recolored(image, shown, photo, counted, through))
         shares.append(share)
         rows.append(_measure(shown, photo[None], share, lpips))
     columns = {key: [row[key] for row in rows] for key in MEASURES}
@@ -71,28 +79,44 @@ def evaluate(
     return {**means, "views": [{"name": name, **row} for name, row in zip(views.names, rows, strict=True)]}
 
 
-def recolored(image: Tensor, shown: Tensor, photo: Tensor, counted: Tensor | None = None) -> Tensor:
+class Through(NamedTuple):
+    """What shows through a view."""
+
+    background: Tensor  # (1, 3, H, W), what shows of the background in the render
+    alpha: Tensor  # (1, H, W), the share of the scene in each pixel of the photo
+
+
+def recolored(
+    image: Tensor, shown: Tensor, photo: Tensor, counted: Tensor | None = None, through: Through | None = None
+) -> Tensor:
     """A render `(1, 3, H, W)` with the gain and offset of each channel that fit `shown` to the photo `(3, H, W)`.
 
     `shown` is the render as it is compared with the photo; least squares in float64 over the pixels `(H, W)` that
-    are counted, or over all.
+    are counted, or over all. The background that shows through gets neither gain nor offset.
     """
     every = slice(None) if counted is None or not bool(counted.any()) else counted.flatten().to(shown.device)
-    x = shown[0].flatten(1)[:, every].double()
-    y = photo.flatten(1)[:, every].double()
-    mean_x = x.mean(1, keepdim=True)
-    mean_y = y.mean(1, keepdim=True)
-    variance = (x - mean_x).square().sum(1, keepdim=True)
-    gain = torch.where(variance > 0, ((x - mean_x) * (y - mean_y)).sum(1, keepdim=True) / variance, 1.0)
+    behind, alpha = (torch.zeros_like(image), torch.ones_like(image[0, :1])) if through is None else through
+    x = (shown - behind)[0].flatten(1)[:, every].double()
+    y = (photo - behind[0]).flatten(1)[:, every].double()
+    a = alpha.flatten(1)[:, every].double()
+    total = a.square().sum().clamp_min(1e-12)
+    mean_x = (a * x).sum(1, keepdim=True) / total
+    mean_y = (a * y).sum(1, keepdim=True) / total
+    rest = x - a * mean_x
+    variance = rest.square().sum(1, keepdim=True)
+    gain = torch.where(variance > 0, (rest * (y - a * mean_y)).sum(1, keepdim=True) / variance, 1.0)
     offset = mean_y - gain * mean_x
-    return image * gain[:, :, None].to(image) + offset[:, :, None].to(image)
+    return (image - behind) * gain[:, :, None].to(image) + offset[:, :, None].to(image) * alpha + behind
 
 
-def mean_psnr(render: Callable[[PinholeCamera], Tensor], views: Views) -> float | None:
-    """Mean PSNR over some views in dB, of clamped renders; None without views, or if one PSNR is infinite."""
+def mean_psnr(render: Callable[..., Tensor], views: Views) -> float | None:
+    """Mean PSNR over some views in dB, of clamped renders; None without views, or if one PSNR is infinite.
+
+    `render` is called as by :meth:`kgs.datasets.scene.Views.render`.
+    """
     values = list[float]()
     for i in range(len(views)):
-        image, photo, share = views.compared(i, render(views.camera(i))[0].cpu())
+        image, photo, share = views.compared(i, views.render(i, render)[0].cpu())
         values.append(float(psnr(image, photo, 1.0)) + decibels(share))
     mean = sum(values) / len(values) if values else math.inf  # a render that equals its photo has no finite PSNR
     return round(mean, 4) if math.isfinite(mean) else None
@@ -109,7 +133,7 @@ def comparable(level: float | None) -> float:
 
 
 def measure_again(
-    path: Path, metrics: dict[str, Any], scene: Scene, render: Callable[[PinholeCamera], Tensor], lpips: Lpips | None
+    path: Path, metrics: dict[str, Any], scene: Scene, render: Callable[..., Tensor], lpips: Lpips | None
 ) -> dict[str, Any]:
     """The content of a metrics.json, measured again; without `lpips`, the old values of LPIPS are copied.
 

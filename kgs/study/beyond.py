@@ -134,7 +134,7 @@ def measure_target(
     shares = list[float]()
     for i, shown in enumerate(target.shown):
         truth = target.views.images[i]
-        image = target.views.as_photo(i, render(target.views.camera(i))[0].cpu())
+        image = target.views.as_photo(i, target.views.render(i, render)[0].cpu())
         shares.append(float(shown.float().mean()))
         if not shown.any():
             continue

@@ -81,9 +81,9 @@ class SelectiveDrop(DropGaussian):
     def forward(self, opacities: Tensor) -> Tensor:
         """Drop and rescale in `train()`, return `opacities` itself in `eval()`; scores have their shape."""
         scores = self.scores
-        rate = self.rate
         if not self.training or scores is None:
             return super().forward(opacities)
+        rate = float(self.rate)
         if scores.shape != opacities.shape:
             raise ValueError(f"scores: expected shape {tuple(opacities.shape)}, got {tuple(scores.shape)}")
         if rate == 0.0:

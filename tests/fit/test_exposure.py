@@ -1,22 +1,27 @@
 """Exposure: gains that were put on are found; a fit holds them, and photos that do not differ have none."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from kgs import GaussianModel, GaussianRenderer, RasterOptions
+from kgs.app.page import fit_page
 from kgs.datasets import synthetic_scene
+from kgs.fit import Fit
 from kgs.fit.config import PRESETS, FitConfig
 from kgs.fit.exposure import LEAST_RATIO, decide_exposure, estimate_gains, with_exposure
 from kgs.fit.measures import measure
 from kgs.fit.plan import make_plan
+from kgs.fit.prune import training_levels
 from kgs.fit.run import choose_points, decide, fit_scene
 from kgs.fit.targets import targets
 from kgs.fit.trainer import Trainer
 from kgs.init_points import InitialPoints, initial_points
 from kgs.init_points.patches import MIN_PATCHES, PatchColors
-from kgs.metrics.evaluate import evaluate, recolored
+from kgs.metrics.evaluate import comparable, evaluate, measure_again, recolored
 
 GAINS = torch.tensor([[0.5, 0.5, 0.5], [0.8, 0.8, 0.8], [1.25, 1.25, 1.25], [1.1, 1.0, 0.8]])
 
@@ -164,6 +169,70 @@ def test_what_is_seen_through_a_photo_has_no_exposure():
             render = surface[:1] + (1 - alpha[:1]) * view.behind(color)[:, None, None]
             torch.testing.assert_close(view.seen(render), view.image, atol=1e-6, rtol=0)
             torch.testing.assert_close(view.image, surface[:1] * gain + (1 - alpha[:1]) * color[:, None, None])
+
+
+GAIN = torch.tensor([0.8, 0.7, 1.2])
+
+
+@pytest.fixture(scope="module", params=[0.0, 1.0], ids=["black", "white"])
+def see_through(request):
+    """A fit that shows its photos: things before a background that no photo exposes, which differ in exposure."""
+    scene = synthetic_scene(train_views=3, test_views=1, size=(48, 64))
+    draw = torch.Generator().manual_seed(0)
+    points = torch.rand(60, 3, generator=draw) * torch.tensor([2.0, 1.5, 1.0]) + torch.tensor([-1.0, -0.75, 3.0])
+    to_world = torch.linalg.inv(scene.train.camera(1).extrinsics[0])
+    points = points @ to_world[:3, :3].T + to_world[:3, 3]
+    model = GaussianModel.from_points(points, 0.1 + 0.6 * torch.rand(60, 3, generator=draw), sh_degree=0)
+    with torch.no_grad():
+        model.opacity_logits.fill_(1.0)
+    behind = torch.full((3,), request.param)
+    renderer = GaussianRenderer().eval()
+    parts = []
+    for views in (scene.train, scene.test):
+        rendered = [renderer(model(), views.camera(i), outputs=("image", "alpha")) for i in range(len(views))]
+        surface = torch.cat([each.image for each in rendered]).detach()
+        alpha = torch.cat([each.alpha for each in rendered]).detach()
+        images = surface * GAIN[:, None, None] + (1 - alpha) * behind[:, None, None]
+        parts.append(replace(views, images=images, masks=alpha))
+    assert 0.1 < float(parts[0].masks.mean()) < 0.9
+    train, test = parts
+    gains = GAIN.repeat(len(train), 1)
+    scene = replace(scene, train=replace(train, gains=gains), test=test, background=behind)
+    config = FitConfig(steps=1, evaluations=1)
+    history = {"needs": {}, "init": {"kind": "dense", "points": 60}, "poses": None}
+    return Fit(scene, model, RasterOptions(), settings=config, history=history)
+
+
+def test_a_background_that_shows_through_is_not_exposed_in_any_measure(see_through):
+    scene = see_through.scene
+    assert comparable(see_through.psnr(scene.train)) > 80
+    assert min(training_levels(see_through)) > 80
+    metrics = measure(see_through)
+    assert comparable(metrics["train"]["psnr"]) > 80
+    assert metrics["test"]["psnr"] < 40
+    assert comparable(metrics["recolored"]["psnr"]) > 60, "the colours of the scene alone are fitted"
+    again = measure_again(Path("metrics.json"), metrics, scene, see_through.render, None)
+    assert again["train"] == metrics["train"]
+
+
+def test_a_background_that_shows_through_is_not_exposed_in_the_curve_and_in_pictures(see_through):
+    scene = see_through.scene
+    bare = replace(scene, train=replace(scene.train, gains=None))
+    plan = make_plan(bare, see_through.settings)
+    needs = {"exposure": {"gains": scene.train.gains.tolist()}}
+    points = InitialPoints(see_through.model.means.detach(), torch.full((60, 3), 0.5), "dense")
+    trainer = Trainer(bare, replace(plan, needs=needs), points)
+    trainer.state.model.load_state_dict(see_through.model.state_dict())
+    trainer._measure_curve()
+    assert comparable(trainer.state.curve[0]["train_psnr"]) > 80
+    assert trainer.state.curve[0]["test_psnr"] < 40
+    for view, target in enumerate(targets(scene.train, scene.background, torch.device("cpu"))):
+        own = GaussianRenderer()(see_through.model(), target.camera, target.behind(scene.background)).image
+        seen = scene.train.as_photo(view, scene.train.render(view, see_through.render))
+        torch.testing.assert_close(seen, target.seen(own).detach(), atol=1e-6, rtol=0)
+    with_metrics = replace(see_through, metrics=measure(see_through))
+    for i, picture in enumerate(fit_page._pictures([scene.train], {"": with_metrics})):
+        torch.testing.assert_close(picture.renders[""], scene.train.images[i], atol=1e-5, rtol=0)
 
 
 def test_recoloured_renders_fit_best():

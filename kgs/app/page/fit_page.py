@@ -192,7 +192,7 @@ def _pictures(parts: Sequence[Views], fits: Mapping[str, Fit]) -> list[Picture]:
     pictures = []
     for views, i in each([(part, i) for part in parts for i in range(len(part))], "page", "view"):
         name = views.names[i]
-        renders = {run: views.as_photo(i, fit.render(views.camera(i))[0]) for run, fit in fits.items()}
+        renders = {run: views.as_photo(i, views.render(i, fit.render)[0]) for run, fit in fits.items()}
         values = [f"{run} {levels[run][name]:.2f} dB".strip() for run in fits if name in levels[run]]
         caption = f"{name}: {', '.join(values)}" if values else name
         pictures.append(Picture(name, views.images[i], renders, caption))
