@@ -212,7 +212,8 @@ def _convert(value: Any, hint: Any) -> tuple[Any, str]:
     if get_origin(hint) is Literal:
         return value if isinstance(value, str) and value in get_args(hint) else None, f"one of {list(get_args(hint))}"
     if hint == Path | None:
-        return Path(value) if isinstance(value, (str, PathLike)) and str(value) else None, "a path"
+        is_path = isinstance(value, (str, PathLike)) and str(value)
+        return (value if isinstance(value, Path) else Path(value)) if is_path else None, "a path"
     if get_origin(hint) is not Annotated:
         return value if isinstance(value, hint) else None, "a name" if hint is str else f"a {hint.__name__}"
     kind, limits = get_args(hint)

@@ -75,7 +75,7 @@ def study(
     from .grid import finished_rows, read_rows, run_grid
     from .report import write_report
 
-    data = None if "KGS_DATA" not in os.environ else Path(os.environ["KGS_DATA"])
+    data = Path(os.environ["KGS_DATA"]) if os.environ.get("KGS_DATA") else None
     if preset == "beyond":
         cells = beyond.beyond_cells(data)
         path = out / "beyond.jsonl"

@@ -19,9 +19,10 @@ from tiny_scenes import write_colmap
 import kgs
 import kgs.app.cli.run
 from kgs.app import cli
+from kgs.app.cli.fit import defaults
 from kgs.app.files.outputs import FILMS
 from kgs.app.files.results_folder import RESULTS
-from kgs.fit.config import DETAILS, DROP, PAPER, FitConfig
+from kgs.fit.config import DETAILS, DROP, PAPER, PRESETS, FitConfig
 
 STEPS = 30
 FIT = ("--init", "scene", "--max-gaussians", 3000)
@@ -150,6 +151,22 @@ def small(tmp_path_factory):
         ("render {file} --cameras {scene} -o {out} --device foo", "--device: expected"),
         ("render {file} --cameras {scene}", " -o transforms_train-render"),
         ("page {missing} --cameras {scene} -o {scene}.html", "missing"),
+        ("fit {scene} -o ''", "--out: expected a path, got ''"),
+        ("fit {scene} -o=", "--out: expected a path, got ''"),
+        ("fit '' -o {out}", "scene: expected a path, got ''"),
+        ("fit ''", "scene: expected a path, got ''"),
+        ("fit {scene} -o {out} --masks=", "--masks: expected a path, got ''"),
+        ("fit {scene} -o {out} --masks ''", "--masks: expected a path, got ''"),
+        ("fit {scene} -o {out} --lpips-weights ''", "--lpips-weights: expected a path, got ''"),
+        ("fit {scene} -o {out} --init file --init-file ''", "--init-file: expected a path, got ''"),
+        ("demo -o ''", "--out: expected a path, got ''"),
+        ("render {file} --cameras '' -o {out}", "--cameras: expected a path, got ''"),
+        ("page '' --cameras {scene}", "ply: expected a path, got ''"),
+        ("clean {file} --out=", "--out: expected a path, got ''"),
+        ("export '' -o {out}", "ply: expected a path, got ''"),
+        ("eval ''", "out: expected a path, got ''"),
+        ("bench speed -o ''", "--out: expected a path, got ''"),
+        ("study -o ''", "--out: expected a path, got ''"),
         ("nonsense", "one of demo, fit, render, eval, page, clean, scale, export, check, bench, study, got 'nonsense'"),
         ("bench nonsense", "one of speed, precision, extremes, got"),
         ("bench sped", "did you mean speed?"),
@@ -160,7 +177,7 @@ def test_mistakes_are_one_line_and_exit_code_2(folder, small, tmp_path, capsys, 
     places = {"missing": tmp_path / "missing", "scene": folder, "small": small, "out": tmp_path / "out"}
     places["file"] = folder / "transforms_train.json"
     before = sorted(folder.rglob("*"))
-    assert run(*(word.format(**places) for word in words.split())) == 2
+    assert run(*(word.format(**places) for word in shlex.split(words))) == 2
     assert said.format(**places) in one_line(capsys)
     assert sorted(folder.rglob("*")) == before
     assert os.listdir(tmp_path) == []  # nothing was begun
@@ -211,16 +228,43 @@ def test_presets_and_details_are_starts_that_options_change(folder, tmp_path, mo
         (["--steps", 700], FitConfig(steps=700)),
         (["--preset", "paper"], PAPER),
         (["--preset", "paper", "--detail", "low"], replace(PAPER, **low)),
+        (["--preset", "paper", "--preset=plain"], PRESETS["plain"]),
+        (["--preset=plain", "--preset", "paper"], PAPER),
+        (["--detail=low", "--detail", "high", "--detail=normal"], FitConfig()),
     ]
     for options, _ in cases:
         assert run("fit", folder, "-o", tmp_path, *options) == 2
     assert [config for config, _ in seen] == [config for _, config in cases]
     full = seen[0][1]
-    assert [size for _, size in seen] == [full, full, full, full, 40, full, full, full]  # smaller than any detail's
+    assert [size for _, size in seen] == [full, full, full, full, 40, *[full] * 6]  # smaller than any detail's
     assert run("fit", folder, "-o", tmp_path, "--preset=plain", "--sh-degree", 1) == 2
     assert seen[-1][0] == replace(PAPER, drop=0.0, sh_degree=1)
     assert run("fit", folder, "-o", tmp_path, "--preset", "none") == 2
     assert len(seen) == len(cases) + 1
+
+
+@pytest.mark.parametrize(
+    ("words", "preset"),
+    [
+        ("--preset paper --preset=plain", "plain"),
+        ("--preset=plain --preset paper", "paper"),
+        ("--preset=plain --title=--preset --preset=auto", "auto"),
+        ("--preset plain -- --preset paper", "plain"),
+        ("--title --preset=plain", "plain"),  # tyro refuses this one
+        ("", "auto"),
+    ],
+)
+def test_the_preset_is_the_one_that_is_given_last(words, preset):
+    assert defaults(words.split())["config"] == PRESETS[preset]
+
+
+def test_words_after_two_dashes_are_no_options(folder, tmp_path, capsys, monkeypatch):
+    (tmp_path / "--help-all").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert run("fit", "-o", "out", "--steps", 1, "--", "--help-all") == 2
+    assert "--help-all: " in one_line(capsys)
+    assert run("fit", "-o", "out", "--steps", 1, "--", "-h") == 2
+    assert "-h: expected a file or folder that is there" in one_line(capsys)
 
 
 def test_versions(capsys, monkeypatch):
@@ -268,6 +312,8 @@ def test_the_help_of_a_fit_is_short_and_its_last_line_names_the_long_one(folder,
         re.findall(r"--[a-z][a-z.-]+", whole)
     )
     assert "(default: 3)" in said["--preset paper --help-all"]  # of --sh-degree
+    assert run("fit", "--help_all") == 0
+    assert capsys.readouterr().out == whole
     hidden = ["--recipe.near-plane", "0.1", "--coarse", "2"]  # both are read
     assert run("fit", folder, "-o", tmp_path / "out", *hidden) == 2
     assert "--coarse: expected" in one_line(capsys)

@@ -13,7 +13,7 @@ from kgs.app.console import VIEWER, as_line, say, say_next
 from kgs.errors import DataError, printable
 from kgs.fit.config import COARSE, DETAILS, PRESETS, Background, FitConfig
 
-from .options import Existing, Out
+from .options import Existing, Out, options_in
 
 
 def defaults(words: list[str]) -> dict[str, Any]:
@@ -24,10 +24,14 @@ def defaults(words: list[str]) -> dict[str, Any]:
 
 
 def _value(words: list[str], option: str) -> str:
-    """The value of an option, "" where it is not given."""
-    joined = [word.partition("=")[2] for word in words if word.startswith(f"{option}=")]
-    values = joined + [value for word, value in pairwise(words) if word == option]
-    return values[-1] if values else ""
+    """The value of an option where it is given last, as tyro takes it; "" where it is not given."""
+    value = ""
+    for word, following in pairwise([*options_in(words), ""]):
+        if word == option:
+            value = following
+        elif word.startswith(f"{option}="):
+            value = word.partition("=")[2]
+    return value
 
 
 def fit(

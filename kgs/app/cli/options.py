@@ -16,6 +16,32 @@ EXISTS = "a file or folder that is there"  # marks paths that are looked for bef
 Existing = Annotated[Path, EXISTS]
 Out = Annotated[Path, tyro.conf.arg(aliases=("-o",))]
 
+
+class EmptyPath(type(Path())):  # type: ignore[misc]  # the class of this system's paths
+    """What "" on a command line becomes: a `Path` would be the current folder."""
+
+
+PATHS = tyro.constructors.ConstructorRegistry()
+
+
+@PATHS.primitive_rule
+def _path(type_info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec[Path] | None:
+    if type_info.type is not Path:
+        return None
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="PATH",
+        instance_from_str=lambda words: Path(words[0]) if words[0] else EmptyPath(),
+        is_instance=lambda value: isinstance(value, Path),
+        str_from_instance=lambda path: [str(path)],
+    )
+
+
+def options_in(words: list[str]) -> list[str]:
+    """The words among which there are options: those after a "--" are none."""
+    return words[: words.index("--")] if "--" in words else words
+
+
 # The short help shows these entries of FitConfig, and all other options of the command but the rare ones.
 _OF_A_FIT = ("steps", "drop", "refine_poses", "seed", "device")
 _RARE = ("downscale", "lpips_weights", "mask_means", "frames", "title", "live")

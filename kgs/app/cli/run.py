@@ -229,11 +229,13 @@ def _flags_of(command: Callable[..., Any]) -> dict[str, str]:
 def _check_out(command: Callable[..., Any], prog: str, words: list[str]) -> None:
     """Refuse a command line that lacks nothing but the folder for the results, and suggest one."""
     out = inspect.signature(command).parameters.get("out")
-    asked = ("--out", "-h", "--help", "--help-all")
+    asked = ("--out", "-h", "--help", "--help-all", "--help_all")
     is_given = any(word in asked or word.startswith("--out=") or word[:2] == "-o" for word in words)
     is_needed = out is not None and out.kind is out.KEYWORD_ONLY and out.default is out.empty
-    if is_given or not is_needed or not words or words[0].startswith("-"):
+    if is_given or not is_needed or "--" in words or not words or words[0].startswith("-"):
         return
+    if not words[0]:
+        raise ValueError(f"{next(iter(inspect.signature(command).parameters))}: expected a path, got ''")
     name = f"{Path(words[0]).resolve().stem}-{prog.rpartition(' ')[2]}"
     whole = as_line(*prog.split(), *words, "-o", name)
     raise SystemExit(f"-o: expected a folder for the results, for example {whole}")
@@ -243,12 +245,13 @@ def _parse(command: Callable[..., Any], prog: str, words: list[str], defaults: d
     """Read the options; returns the call that they ask for, once its input paths are there."""
     import tyro
 
-    from .options import EXISTS, describe, has_short_help, short
+    from .options import EXISTS, PATHS, EmptyPath, describe, has_short_help, options_in, short
 
     _check_out(command, prog, words)
-    if "--help-all" in words:
-        words = ["--help" if word == "--help-all" else word for word in words]
-    elif has_short_help(command) and {"-h", "--help"} & {*words}:
+    asked = options_in(words)
+    if {"--help-all", "--help_all"} & {*asked}:
+        words = ["--help" if word in ("--help-all", "--help_all") else word for word in asked]
+    elif has_short_help(command) and {"-h", "--help"} & {*asked}:
         try:
             plain = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)
             tyro.cli(short(command, defaults["config"]), prog=prog, args=["--help"], config=plain)
@@ -265,12 +268,15 @@ def _parse(command: Callable[..., Any], prog: str, words: list[str], defaults: d
             hint = command.__annotations__[name]
             path = value if any(EXISTS in get_args(part) for part in (hint, *get_args(hint))) else None  # or optional
             if isinstance(value, FitConfig):
-                path = value.init_file
+                name, path = "init_file", value.init_file
+            if EmptyPath in (type(value), type(path)):
+                raise ValueError(f"{name}: expected a path, got ''")
             if path is not None and not path.exists():
                 raise DataError(path, "", f"expected {EXISTS}, found none")
         return partial(command, *arguments, **options)
 
     describe(bind, command)
     function = partial(bind, **defaults) if defaults else bind
-    call: partial[Any] = tyro.cli(function, prog=prog, args=words, config=markers)
+    with PATHS:
+        call: partial[Any] = tyro.cli(function, prog=prog, args=words, config=markers)
     return call
