@@ -8,6 +8,14 @@ MASK_MEANINGS = ("away", "absent")  # of black in a mask: ignored pixels, or emp
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
+def held_out_between_ends(count: int, every: int) -> range:
+    """Which of `count` photos between the ends of a row of cameras are held out: about every `every`-th, at least one.
+
+    With more photos, no fewer are left to train on.
+    """
+    return range(min(every // 2, (count - 1) // 2), count, every)
+
+
 def check_options(
     downscale: Any, hold_out: Any, background: str = "black", points: str = "none", mask_means: str = "away"
 ) -> None:

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from .options import held_out_between_ends
+
 TEST_EVERY = 8
 BLENDER_TRAIN_FRAMES = (2, 16, 26, 55, 73, 76, 86, 93)
 
@@ -34,7 +36,7 @@ def split_between_ends(
     spread = centers - centers.mean(axis=0)
     along = spread @ np.linalg.svd(spread, full_matrices=False)[2][0]
     inner = sorted({*range(len(names))} - {int(along.argmin()), int(along.argmax())}, key=lambda i: names[i])
-    test = inner[min(every // 2, (len(inner) - 1) // 2) :: every]
+    test = [inner[i] for i in held_out_between_ends(len(inner), every)]
     pool = sorted({*range(len(names))} - {*test}, key=lambda i: names[i])
     return [pool[i] for i in select_evenly(len(pool), train_views)], test
 

@@ -30,7 +30,7 @@ from kgs.app.page.fit_page import PAGE, write_own_page
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError, printable
 from kgs.fit.checkpoint import save_checkpoint
-from kgs.fit.config import FitConfig
+from kgs.fit.config import FitConfig, least_side
 from kgs.fit.fit import Fit
 from kgs.fit.measures import measure
 from kgs.fit.plan import Plan, expected_memory, make_plan, most_gaussians
@@ -167,7 +167,7 @@ def _state(folder: Path) -> str:
 
 def _check_size(scene: Scene, config: FitConfig, lpips: Lpips | None) -> None:
     """A DataError where images are too small for the measures."""
-    smallest = max(16 if lpips else 6, 12 if config.coarse else 6)
+    smallest = least_side(config, lpips is not None)
     for views in (scene.train, scene.test):
         height, width = views.images.shape[-2:]
         if min(height, width) < smallest:

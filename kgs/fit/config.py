@@ -196,6 +196,11 @@ class FitConfig:
             raise ValueError(f"values: expected the entries of a FitConfig, got {error}") from error
 
 
+def least_side(config: FitConfig, lpips: bool) -> int:
+    """The least pixels of the shorter side of photos in a fit, whose result is measured with or without LPIPS."""
+    return max(16 if lpips else 6, 12 if config.coarse else 6)
+
+
 def _check(config: FitConfig | Recipe) -> None:
     """Check each entry against its annotation; NumPy's numbers become Python's, and text becomes a path."""
     hints = get_type_hints(type(config), include_extras=True)

@@ -104,6 +104,11 @@ MISTAKES = [  # words, what is said of them, and a package that is not installed
     ("fit photos -o out --size 99 --downscale 2", "--size: expected either", ""),
     ("fit photos -o out --views 0", "--views: expected", ""),
     ("fit photos -o out --views 5", "--views: expected at most 4", ""),
+    ("fit twelve -o out --hold-out 4 --views 11", "--views: expected at most 10 of 12 photos of which 2", ""),
+    ("fit film.mp4 -o out --frames 5 --views 6", "--views: expected at most 5 of 5 frames, got 6", ""),
+    ("fit film.mp4 -o out --hold-out 2 --views 30", "--views: expected at most 19 of 36 frames", ""),
+    ("fit photos -o out --init scene", "--init: expected another one for photos", ""),
+    ("fit posed -o out --init scene", "--init: expected another one for the layout COLMAP", ""),
     ("fit photos -o out --downscale 0.5", "--downscale: expected", ""),
     ("fit photos -o out --hold-out 1", "--hold-out: expected", ""),
     ("fit photos -o out --device gpu", "--device: expected", ""),
@@ -143,11 +148,19 @@ for words, said, package in json.load(sys.stdin):
 
 def test_what_folders_and_options_show_is_told_before_torch_is_loaded(tmp_path):
     """In one process, whose start would take most of the time."""
-    for name, count in (("empty", 0), ("two", 2), ("photos", 4), ("heic", 3), ("poses/sparse/0", 0), ("taken", 0)):
+    counts = {"empty": 0, "two": 2, "photos": 4, "twelve": 12, "heic": 3, "poses/sparse/0": 0, "taken": 0}
+    counts |= {"posed/sparse/0": 0, "posed/images": 2}
+    for name, count in counts.items():
         (tmp_path / name).mkdir(parents=True)
         for i in range(count):
             (tmp_path / name / f"{i}.png").touch()
-    for name in ("heic/a.heic", "poses/sparse/0/images.bin", "taken/splat.ply"):
+    for name in (
+        "heic/a.heic",
+        "poses/sparse/0/images.bin",
+        "posed/sparse/0/images.bin",
+        "taken/splat.ply",
+        "film.mp4",
+    ):
         (tmp_path / name).touch()
     before = sorted(tmp_path.rglob("*"))
     imports = "import json\nimport kgs.app.cli\nfrom kgs.datasets import folders\n"

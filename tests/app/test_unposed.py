@@ -5,7 +5,8 @@ import shutil
 
 import numpy as np
 import pytest
-from command import run
+import torch
+from command import one_line, run
 from kornia.geometry.conversions import rotation_matrix_to_quaternion
 
 from kgs.app import sfm
@@ -137,6 +138,40 @@ def test_all_photos_are_trained_on_unless_some_are_held_out(folder, tmp_path):
     along = (places - places.mean(0)) @ np.linalg.svd(places - places.mean(0))[2][0]
     ends = [list(cameras)[int(i)] for i in (along.argmin(), along.argmax())]
     assert not {*held_out} & {*ends}
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ("--views 8 --hold-out 4", "--views: expected at most 7 of 9 photos of which 2 are held out, got 8"),
+        ("--downscale 4", "--downscale: expected 32 pixels or more of the longer side, got 24x18 of 96x72"),
+        ("--backend triton", "triton"),
+        ("--device meta", "--device: expected"),
+        ("--init scene", "--init: expected another one"),
+        ("--init file --init-file {photos}/IMG_0.png", "expected a point cloud or mesh"),
+    ],
+)
+def test_what_cannot_work_is_refused_before_cameras_are_found(
+    folder, tmp_path, asked, capsys, monkeypatch, options, said
+):
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    photos = folder(9)
+    words = options.format(photos=photos).split()
+    assert run("fit", photos, "-o", tmp_path / "out", *words) == 2
+    assert said in one_line(capsys)
+    assert asked == []
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("options", ["--size 48 --coarse 0.5", "--size 32", "--downscale 9.3"])
+def test_panoramas_that_get_too_low_are_refused_before_cameras_are_found(tmp_path, asked, capsys, options):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for i in range(3):
+        write_png(photos / f"{i}.png", torch.zeros(3, 50, 300))
+    assert run("fit", photos, "-o", tmp_path / "out", *options.split()) == 2
+    assert " pixels or more of the shorter side, got " in one_line(capsys)
+    assert asked == []
 
 
 def test_photos_are_told_from_scenes(folder, tmp_path, asked):

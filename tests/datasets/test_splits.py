@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from kgs.datasets.options import held_out_between_ends
 from kgs.datasets.splits import select_evenly, split_between_ends, split_by_name
 
 # Global positions in the name-sorted list; the strings are the tables of the sparse-view literature.
@@ -82,3 +83,11 @@ def test_photos_at_the_ends_of_the_row_are_never_held_out(count: int, every: int
     assert not {*test} & {int(places.argmin()), int(places.argmax())}
     assert [*train] == sorted(train)
     assert len(split_between_ends(names, centers, 2, every)[0]) == 2
+    assert len(held_out_between_ends(count - 2, every)) == len(test), "it follows from the number of photos alone"
+
+
+@pytest.mark.parametrize("every", [2, 3, 4, 7, 8, 50])
+def test_more_photos_never_leave_fewer_to_train_on(every: int) -> None:
+    left = [count - len(held_out_between_ends(count - 2, every)) for count in range(3, 120)]
+    assert left == sorted(left)
+    assert left[0] == 2

@@ -11,6 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from kgs.datasets import folders
+from kgs.datasets.options import held_out_between_ends
 from kgs.errors import DataError
 
 SMALLEST = 32  # pixels of the longer side of a fit's photos
@@ -93,25 +94,55 @@ def check_results(out: Path) -> None:
     read_json(config)
 
 
-def check_photos(folder: Path, out: Path, views: int | None, hold_out: int | None, downscale: float | None) -> None:
-    """Check a folder of unposed photos, and the options about them; only `downscale` needs the photos' headers.
+def check_photos(
+    folder: Path,
+    out: Path,
+    views: int | None,
+    hold_out: int | None,
+    size: int | None,
+    downscale: float | None,
+    frames: int | None,
+    shortest: int,
+) -> None:
+    """Check a folder of unposed photos or a video, and the options about them, before their cameras are found.
 
-    Nothing of a video can be told before its frames are looked at.
+    Args:
+        folder: of the photos, or a video. Of a video only the largest number of frames is known.
+        out: the folder for the results.
+        views: to train on.
+        hold_out: every Nth photo is held out.
+        size: longer side of the photos in the fit; it needs the photos' headers, as `downscale` does.
+        downscale: factor by which the photos are reduced.
+        frames: to be taken from a video.
+        shortest: least pixels of the shorter side in the fit.
     """
-    from kgs.app.sfm.find import find_photos, find_video
+    from kgs.app.sfm.find import MOST_FRAMES, find_photos, find_video
     from kgs.app.sfm.place import check_place
 
     if find_video(folder):
+        _check_views(views, hold_out, MOST_FRAMES if frames is None else frames, "frames")
         return
     paths = find_photos(folder)
     check_place(out, folder)
-    most = len(paths) - (1 if hold_out else 0)
-    if views is not None and views > most:
-        raise ValueError(f"views: expected at most {most} of {len(paths)} photos, got {views}")
-    if downscale is not None:
-        from kgs.datasets.image_file import read_size
+    _check_views(views, hold_out, len(paths), "photos")
+    if size is None and downscale is None:
+        return
 
-        width, height = min(read_size(path) for path in paths)
-        if max(width, height) / downscale < SMALLEST:
-            shrunk = f"{max(1, round(width / downscale))}x{max(1, round(height / downscale))} of {width}x{height}"
-            raise ValueError(f"downscale: expected {SMALLEST} pixels or more of the longer side, got {shrunk}")
+    from kgs.datasets.image_file import read_size
+
+    width, height = min(read_size(path) for path in paths)
+    name = "size" if downscale is None else "downscale"
+    factor = max(1.0, max(width, height) / size) if size is not None else downscale or 1.0
+    reduced = [max(1, round(side / factor)) for side in (width, height)]
+    for side, least, pixels in (("longer", SMALLEST, max(reduced)), ("shorter", shortest, min(reduced))):
+        if pixels < least:
+            got = f"{reduced[0]}x{reduced[1]} of {width}x{height}"
+            raise ValueError(f"{name}: expected {least} pixels or more of the {side} side, got {got}")
+
+
+def _check_views(views: int | None, hold_out: int | None, count: int, what: str) -> None:
+    """Raise a ValueError for more training views than `count` photos leave whose cameras kgs finds."""
+    most = count - len(held_out_between_ends(count - 2, hold_out)) if hold_out else count
+    if views is not None and views > most:
+        rest = f" of which {count - most} are held out" if hold_out else ""
+        raise ValueError(f"views: expected at most {most} of {count} {what}{rest}, got {views}")

@@ -11,7 +11,7 @@ import tyro
 
 from kgs.app.console import VIEWER, as_line, say, say_next
 from kgs.errors import DataError, printable
-from kgs.fit.config import COARSE, DETAILS, PRESETS, Background, FitConfig
+from kgs.fit.config import COARSE, DETAILS, PRESETS, Background, FitConfig, least_side
 
 from .options import Existing, Out, options_in
 
@@ -99,14 +99,17 @@ def fit(
     from kgs.datasets.field import field_size
     from kgs.datasets.folders import CAMERAS_REPORT
     from kgs.fit.prune import left_out
-    from kgs.machine import check_packages
+    from kgs.init_points.files import read_points
+    from kgs.machine import check_tools
     from kgs.metrics.evaluate import as_text
     from kgs.metrics.lpips import Lpips
 
     from .checks import SMALLEST
     from .unposed import find_scene, is_unposed, on_ctrl_c
 
-    check_packages("safetensors", "jinja2")
+    check_tools(config.device, config.backend, "safetensors", "jinja2")
+    if config.init_file is not None:
+        read_points(config.init_file)  # an error now, not once there are cameras
     lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(config.device)
     request = SceneRequest(
         scene=os.path.abspath(scene),
@@ -197,6 +200,7 @@ def check_fit(
     """Check the arguments of `kgs fit`."""
     from kgs.app.files.outputs import check_folder
     from kgs.app.sfm.find import FEWEST, find_video
+    from kgs.datasets.folders import layout_of
     from kgs.datasets.options import check_options
     from kgs.metrics.weights import weight_files
 
@@ -226,6 +230,16 @@ def check_fit(
         weight_files(lpips_weights)
     check_folder(out, scene, make=False)
     if unposed:
-        check_photos(scene, out, views, hold_out, downscale)
+        if config.init == "scene":
+            raise ValueError(
+                "init: expected another one for photos without camera poses, got 'scene', Blender's points"
+            )
+        assert not isinstance(size, str)
+        shortest = least_side(config, lpips_weights is not None)
+        check_photos(scene, out, views, hold_out, size, downscale, frames, shortest)
     else:
         check_scene(scene)
+        if config.init == "scene" and layout_of(scene) != "Blender":
+            raise ValueError(
+                f"init: expected another one for the layout {layout_of(scene)}, got 'scene', Blender's points"
+            )

@@ -22,6 +22,7 @@ from kgs.datasets.folders import (
 from kgs.errors import DataError, listed
 
 FEWEST = 3
+MOST_FRAMES = 36  # of a video, where twelve would be too far apart
 _LISTED = 10
 CONVERT = (
     'kgs reads PNG, JPEG, WebP, TIFF and BMP, and HEIC with its extra (pip install -e ".[heic]"). Or make JPEGs: on a '

@@ -26,12 +26,11 @@ from kgs.app.files.outputs import write_png
 from kgs.errors import DataError
 from kgs.progress import ProgressBar
 
-from .find import FEWEST
+from .find import FEWEST, MOST_FRAMES
 from .match import DEFAULT_FOCAL
 from .read import sharpness
 
 FRAMES = 12
-MOST_FRAMES = 36  # where twelve would be too far apart
 LEAST_DEGREES = 3.0  # between neighbours
 MOST_DEGREES = 10.0
 _LOOKED_AT = 500  # frames, spread over the video
