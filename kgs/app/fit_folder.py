@@ -287,20 +287,23 @@ def train(
     """Train to the end with a progress line, and :func:`prune`; save checkpoints each minute and at evaluations.
 
     `live` shows the splat. SIGINT (Ctrl-C), SIGTERM and SIGHUP end the training after the current step. Returns the fit
-    and the number of that signal, or 0. If a checkpoint cannot be written (a full disk), a note says so, and training
-    goes on.
+    and the number of that signal, or 0. If a checkpoint cannot be written (a full disk), a note says so the first time,
+    and training goes on.
     """
     saved = time.monotonic()
+    has_failed = False
     times = trainer.plan.times
 
     def save(part: dict[str, Any] | None = None) -> None:
-        nonlocal saved
+        nonlocal saved, has_failed
         saved = time.monotonic()
         if checkpoint is not None:
             try:
                 trainer.save(checkpoint, part)
             except OSError as error:
-                trainer.state.note(f"step {trainer.step}: no checkpoint: {error}")
+                if not has_failed:  # the next one is tried a minute later: no line for each
+                    trainer.state.note(f"step {trainer.step}: no checkpoint: {error}")
+                has_failed = True
 
     with _interruptible() as stopped, progress(times.steps, title, trainer.step) as advance:
 

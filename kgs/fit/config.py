@@ -190,10 +190,13 @@ class FitConfig:
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Self:
         """The inverse of `to_dict`; ValueError where an entry is unknown or out of range."""
-        try:
-            return cls(**{**values, "recipe": Recipe(**values.get("recipe", {}))})
-        except (AttributeError, TypeError) as error:
-            raise ValueError(f"values: expected the entries of a FitConfig, got {error}") from error
+        recipe = values.get("recipe", {}) if isinstance(values, dict) else None
+        if not isinstance(recipe, dict):
+            raise ValueError(f"values: expected the entries of a FitConfig, got {str(values)[:60]!r}")
+        for kind, entries in ((cls, values), (Recipe, recipe)):
+            if unknown := sorted({*map(str, entries)} - {entry.name for entry in fields(kind)}):
+                raise ValueError(f"values: expected the entries of a {kind.__name__}, got {unknown[0]!r}")
+        return cls(**{**values, "recipe": Recipe(**recipe)})
 
 
 def least_side(config: FitConfig, lpips: bool) -> int:

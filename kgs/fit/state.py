@@ -172,7 +172,8 @@ class TrainState:
             if model.max_sh_degree != (plan.config.sh_degree or 0) or model.means.dtype != torch.float32:
                 raise ValueError(f"model: expected float32 and harmonics of degree {plan.config.sh_degree}, got others")
             start = Start(*(copy.deepcopy(values[name]) for name in ("init", "extent", "near_plane", "depth")))
-            state = cls._assemble(scene, plan, model, start)
+        state = cls._assemble(scene, plan, model, start)
+        with state_errors():
             for name in ("step", "seconds", "stack", "curve", "notes"):
                 setattr(state, name, copy.deepcopy(values[name]))
             state.optimizer.load_state_dict(copy.deepcopy(values["optimizer"]))
@@ -198,6 +199,8 @@ def state_errors() -> Iterator[None]:
         yield
     except KeyError as error:
         raise ValueError(f"{error.args[0]}: expected this entry in the state, got none") from error
+    except torch.OutOfMemoryError:  # says nothing about the state
+        raise
     except (AttributeError, RuntimeError, TypeError) as error:
         raise ValueError(f"state: {error}") from error
 

@@ -7,8 +7,8 @@ the same views in the same order.
 import math
 import os
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -39,6 +39,16 @@ from .state import TrainState, check_saved, fingerprint, state_errors
 from .targets import Target, background_of, targets
 
 _LOOK = 20  # steps between limits of the scales, and on a GPU between looks for faults: a read waits for all work
+
+
+@contextmanager
+def _errors_of(path: str | PathLike[str]) -> Iterator[None]:
+    """Turn a ValueError, which begins with the name of an entry, into an error about this checkpoint."""
+    try:
+        yield
+    except ValueError as error:
+        field, _, reason = str(error).partition(": ")
+        raise DataError(path, field, reason) from error
 
 
 class Trainer:
@@ -220,7 +230,7 @@ class Trainer:
             runs = next(x for x in BACKENDS if x.name == values["backend"]).runs_on(plan.device)
             backend = resolve(values["backend"] if runs else "auto", plan.device)
             exposed = with_exposure(self._given, values["needs"])
-            state = TrainState.from_dict(self._given, plan, values)
+        state = TrainState.from_dict(self._given, plan, values)
         self.plan = replace(plan, backend=backend, needs=values["needs"])
         state.notes += longer
         self._use(state, exposed)
@@ -249,23 +259,27 @@ class Trainer:
         What the configuration leaves open is as it was decided for the checkpoint.
 
         Raises:
+            TypeError: an argument is of another type.
             DataError: both files are damaged, or they belong to another scene or configuration.
+            ValueError: the device cannot be used, or the backend does not run on it.
+            ModuleNotFoundError: the backend is numba or triton, and it is not installed.
         """
+        check_kind("scene", scene, Scene)
+        check_kind("config", config, FitConfig)
         values, damage = newest_checkpoint(Path(path))
         try:
-            for name in ("sh_degree", "drop"):
-                if getattr(config, name) is None:
-                    config = replace(config, **{name: values["config"][name]})
-            if config.recipe.opacity_decay is None:  # more steps may have another
-                decay = values["config"]["recipe"]["opacity_decay"]
-                config = replace(config, recipe=replace(config.recipe, opacity_decay=decay))
-            plan = make_plan(scene, config)
-            trainer = cls(scene, plan, values)
+            saved = values["config"]
+            decided = {name: saved[name] for name in ("sh_degree", "drop") if getattr(config, name) is None}
+            decay = config.recipe.opacity_decay
+            if decay is None:  # more steps may have another
+                decay = saved["recipe"]["opacity_decay"]
         except (KeyError, TypeError) as error:
             raise DataError(path, "config", "expected the configuration of a fit, got another") from error
-        except ValueError as error:
-            field, _, reason = str(error).partition(": ")
-            raise DataError(path, field, reason) from error
+        with _errors_of(path):
+            config = replace(config, **decided, recipe=replace(config.recipe, opacity_decay=decay))
+        plan = make_plan(scene, config)
+        with _errors_of(path):
+            trainer = cls(scene, plan, values)
         trainer.saved = f"{path} of step {trainer.step}"
         if damage:
             with suppress(OSError):  # else the next checkpoint would put the damaged one in place of the whole one

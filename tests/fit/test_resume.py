@@ -109,6 +109,30 @@ def test_another_setting_is_named_by_its_flag(scene, saved, change, flag):
         Trainer.resume(scene, replace(CONFIG, **change), saved)
 
 
+def test_a_mistake_in_kgs_or_of_the_caller_is_no_fault_of_the_checkpoint(scene, saved, monkeypatch):
+    for arguments, name in ((("scene", CONFIG), "scene"), ((scene, CONFIG.to_dict()), "config")):
+        with pytest.raises(TypeError, match=f"^{name}: expected"):
+            Trainer.resume(*arguments, saved)
+    with pytest.raises(ValueError, match="^device: expected"):
+        Trainer.resume(scene, replace(CONFIG, device="meta"), saved)
+
+    def broken(*_, **__):
+        raise TypeError("unsupported operand")
+
+    for place in ("kgs.fit.trainer.make_plan", "kgs.fit.state.TrainState._assemble", "kgs.fit.trainer.targets"):
+        with monkeypatch.context() as patch:
+            patch.setattr(place, broken)
+            with pytest.raises(TypeError, match="unsupported operand"):
+                Trainer.resume(scene, CONFIG, saved)
+
+    def without_memory(*_, **__):
+        raise torch.OutOfMemoryError("out of memory")
+
+    monkeypatch.setattr("kgs.fit.state.GaussianModel", without_memory)
+    with pytest.raises(torch.OutOfMemoryError):
+        Trainer.resume(scene, CONFIG, saved)
+
+
 def test_a_fit_may_go_on_on_another_device(scene, saved):
     resumed = Trainer.resume(scene, replace(CONFIG, device="cpu:0"), saved)
     assert resumed.step == 2

@@ -101,26 +101,29 @@ def test_an_interrupted_fit_writes_its_results_and_goes_on(
     assert (tmp_path / "splat.ply").read_bytes() == (whole / "splat.ply").read_bytes()
 
 
-def test_a_full_disk_is_a_note_and_the_next_checkpoint_is_tried(
-    trainer: Trainer, tmp_path: Path, monkeypatch: Any
+@pytest.mark.parametrize("steps", [(6, 9), (3, 9), range(1, 12)])
+def test_a_full_disk_is_one_note_and_the_next_checkpoint_is_tried(
+    trainer: Trainer, tmp_path: Path, monkeypatch: Any, steps: Any
 ) -> None:
     plain, failed = os.fsync, []
+    if len(steps) > 2:
+        monkeypatch.setattr(app, "_SAVE_SECONDS", 0.0)
 
     def full(descriptor: int) -> None:
-        if trainer.step in (6, 9):
+        if trainer.step in steps:
             failed.append(trainer.step)
             raise OSError(28, "No space left on device")
         plain(descriptor)
 
     monkeypatch.setattr("os.fsync", full)
     assert train(trainer, tmp_path / CHECKPOINT)[1] == 0
-    assert failed == [6, 9]
-    notes = [note for note in trainer.state.notes if "no checkpoint" in note]
-    assert len(notes) == 2
-    assert "step 6" in notes[0]
-    assert CHECKPOINT in notes[0]
-    assert load_checkpoint(tmp_path / CHECKPOINT)["step"] == 12
-    assert sorted(p.name for p in tmp_path.iterdir()) == [previous(Path(CHECKPOINT)).name, CHECKPOINT]
+    assert failed == [*steps]
+    (note,) = trainer.state.notes
+    assert note.startswith(f"step {steps[0]}: no checkpoint: ")
+    assert CHECKPOINT in note
+    values = load_checkpoint(tmp_path / CHECKPOINT)
+    assert (values["step"], values["notes"]) == (12, [note])
+    assert len(steps) > 2 or sorted(p.name for p in tmp_path.iterdir()) == [previous(Path(CHECKPOINT)).name, CHECKPOINT]
 
 
 def test_checkpoints_are_written_by_the_clock_too(trainer: Trainer, tmp_path: Path, monkeypatch: Any) -> None:
