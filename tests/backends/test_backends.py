@@ -48,6 +48,13 @@ def test_auto_takes_what_covers_the_call_and_torch_takes_the_rest(half):
     assert torch.equal(render(9, "auto"), render(9, "torch"))
 
 
+def test_the_error_about_a_device_names_all_that_run_there():
+    with pytest.raises(ValueError, match='"torch" on cuda, got "numba", which runs on cpu alone; "triton" runs on'):
+        backends.resolve("numba", torch.device("cuda"))
+    with pytest.raises(ValueError, match='"torch" on mps, got "triton", which runs on cuda and xpu alone$'):
+        backends.resolve("triton", torch.device("mps"))
+
+
 @pytest.mark.parametrize(("backend", "own"), [("half", 4), ("torch", 8)])
 def test_the_tile_size_is_the_backends_own_unless_it_is_given(half, backend, own):
     projected = kgs.project(random_gaussians(30, 0, sh_degree=None), random_camera(8, 12, 0))

@@ -2,6 +2,7 @@
 
 import os
 import re
+import warnings
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -109,7 +110,8 @@ def fit(
 
     check_tools(config.device, config.backend, "safetensors", "jinja2")
     if config.init_file is not None:
-        read_points(config.init_file)  # an error now, not once there are cameras
+        with warnings.catch_warnings(action="ignore"):
+            read_points(config.init_file)  # an error now, not once there are cameras
     lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(config.device)
     request = SceneRequest(
         scene=os.path.abspath(scene),
