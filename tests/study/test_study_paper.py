@@ -71,6 +71,6 @@ def test_a_table_that_is_not_there(data, table):
         cells_of_table(presets.sparse_cells("paper", data), table, data)
 
 
-def test_a_table_of_another_preset_is_refused_before_any_work():
+def test_a_table_of_another_preset_is_refused_before_any_work(tmp_path):
     with pytest.raises(ValueError, match=r"^table: .*'paper'.*'quick'"):
-        check_study(preset="quick", table=1, steps=None, lpips_weights=None)
+        check_study(tmp_path, preset="quick", table=1, steps=None, lpips_weights=None)

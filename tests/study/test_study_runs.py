@@ -67,8 +67,8 @@ def test_other_steps_make_other_cells_that_differ_in_nothing_else(preset):
 
 
 @pytest.mark.parametrize("steps", [0, -1])
-def test_steps_are_checked_as_those_of_a_fit(steps):
-    for call in (presets.with_steps, lambda _, steps: check_study("quick", None, steps, None)):
+def test_steps_are_checked_as_those_of_a_fit(steps, tmp_path):
+    for call in (presets.with_steps, lambda _, steps: check_study(tmp_path, "quick", None, steps, None)):
         with pytest.raises(ValueError, match=f"^steps: .*{steps}"):
             call([tiny_cell()], steps)
 
