@@ -11,7 +11,7 @@ import shutil
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
-from itertools import count
+from itertools import chain, count
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -133,9 +133,11 @@ def discard(work: Path, names: Sequence[str] = ()) -> None:
 
 def clear(out: Path, names: Iterable[str], kind: str, say: Say = say) -> None:
     """Move what is in the way of new results to `out/kept`: all that a command of the same kind did not write there."""
-    moved = list(_clear(out, names, read_marker(out).get(kind, {})))
-    if moved:
-        say(f"{printable(out)}: what was there and not as kgs wrote it is now {listed(moved, _MOST_NAMED)}")
+    own = read_marker(out).get(kind, {})
+    blocked = [path for name in names if (path := _in_the_way(out, name, own.get(name, ()))) is not None]
+    kept = [_keep(out, path) for path in dict.fromkeys(blocked)]
+    if kept:
+        say(f"{printable(out)}: what was there and not as kgs wrote it is now {listed(kept, _MOST_NAMED)}")
 
 
 def is_own(folder: Path, name: str) -> bool:
@@ -196,20 +198,14 @@ def _move(work: Path, out: Path, all_former: bool, say: Say) -> None:
     discard(work)
 
 
-def _clear(out: Path, names: Iterable[str], own: Hashes) -> Iterator[str]:
-    """Move what is in the way of files to `kept`, or `kept-2` and so on where names are taken; yields its new names."""
-    for name in names:
-        path = _in_the_way(out, name, own.get(name, ()))
-        if path is None:
-            continue
-        moved = path.relative_to(out).as_posix()
-        for number in count(1):
-            kept = out / (KEPT if number == 1 else f"{KEPT}-{number}")
-            if not os.path.lexists(kept / moved) and _in_the_way(out, f"{kept.name}/{moved}", ()) is None:
-                break
-        (kept / moved).parent.mkdir(parents=True, exist_ok=True)
-        os.rename(path, kept / moved)
-        yield f"{kept.name}/{moved}"
+def _keep(out: Path, path: Path) -> str:
+    """Move a file, folder or link to `kept`, or `kept-2` and so on where its name is taken; returns its new name."""
+    name = path.relative_to(out).as_posix()
+    folders = chain([KEPT], (f"{KEPT}-{number}" for number in count(2)))
+    kept = next(f"{folder}/{name}" for folder in folders if _in_the_way(out, f"{folder}/{name}", ()) is None)
+    (out / kept).parent.mkdir(parents=True, exist_ok=True)
+    os.rename(path, out / kept)
+    return kept
 
 
 def _in_the_way(folder: Path, name: str, own: Iterable[str]) -> Path | None:
