@@ -4,7 +4,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -15,11 +15,10 @@ from kgs.app.files.cameras import as_taken
 from kgs.app.files.figures import write_curve
 from kgs.app.files.locks import locked
 from kgs.app.files.outputs import check_folder, png_names, write_png
-from kgs.app.files.publishing import begin, clear, complete, enter, publish, unpublished
+from kgs.app.files.publishing import begin, complete, enter, publish, replacing, unpublished
 from kgs.app.files.results_folder import (
     CHECKPOINT,
     PREVIOUS,
-    RESULTS,
     discard_fit,
     is_finished,
     resumable_fits,
@@ -105,7 +104,6 @@ def fit_folder(
     _check_size(scene, config, lpips)
     names = png_names([*scene.train.names, *scene.test.names])
     _check_out(out, scene)
-    files = [*RESULTS, *(f"test/{names[view]}" for view in scene.test.names)]
     with locked(out), ExitStack() as until_the_end:
         complete(out, say)
         trainer, work = _trainer(scene, config, plan, out, resume, say, stages)
@@ -114,29 +112,26 @@ def fit_folder(
         try:
             if not (work / CHECKPOINT).exists():
                 save_checkpoint(work / CHECKPOINT, trainer.state_dict())  # initial points can take a minute
-            clear(work, ["config.json"], "fit", say)
-            write_json(work / "config.json", _settings(trainer, request))
-            enter(work, "fit", ["config.json"])
+            with replacing(work, "fit", say=say) as new:
+                write_json(new / "config.json", _settings(trainer, request))
             stages.begin("fit")
             page = until_the_end.enter_context(_live_page(trainer, request, out, say)) if live else None
             fit, stopped_by = train(trainer, work / CHECKPOINT, live=page)
             is_trained = True
-            clear(work, (name for name in files if name not in (CHECKPOINT, PREVIOUS)), "fit", say)
-            stages.begin("film")
-            fit = _write_results(fit, work, names, request, lpips)
-            for note in fit.notes:
-                trainer.state.note(note)
-            stages.begin("page")
-            write_own_page(work, out, fit, request)
-            if not trainer.is_saved:  # results and checkpoint belong together
-                trainer.save(work / CHECKPOINT, fit.part)
-            enter(work, "fit", files)
+            with replacing(work, "fit", keep_on_error=True, say=say) as new:
+                stages.begin("film")
+                fit = _write_results(fit, new, names, request, lpips)
+                for note in fit.notes:
+                    trainer.state.note(note)
+                stages.begin("page")
+                write_own_page(new, out, fit, request, config=work / "config.json")
+                if not trainer.is_saved:  # results and checkpoint belong together
+                    trainer.save(work / CHECKPOINT, fit.part)
+            enter(work, "fit", (CHECKPOINT, PREVIOUS))
         except BaseException:
             if is_trained:
-                with suppress(OSError):  # the disk is full
-                    enter(work, "fit", files)
                 notes.say_new()
-                say(f"{printable(work)}: holds the results that could be written")
+                say(f"{printable(new)}: holds the results that could be written")
             elif not trainer.saved:
                 discard_fit(work)
             raise

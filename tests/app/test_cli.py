@@ -20,8 +20,8 @@ import kgs
 import kgs.app.cli.run
 from kgs.app import cli
 from kgs.app.cli.fit import defaults
-from kgs.app.files.outputs import FILMS
-from kgs.app.files.results_folder import RESULTS
+from kgs.app.files.outputs import EXPORTS, FILMS
+from kgs.app.files.results_folder import CHECKPOINT, PREVIOUS
 from kgs.fit.config import DETAILS, DROP, PAPER, PRESETS, FitConfig
 
 STEPS = 30
@@ -37,7 +37,8 @@ def fitted(folder, tmp_path_factory):
 
 def test_fit_writes_everything(fitted):
     files = set(os.listdir(fitted))
-    assert {*RESULTS, "test"} - {*FILMS} <= files
+    results = {"config.json", "metrics.json", "splat.ply", "curve.png", "index.html", "test", CHECKPOINT, PREVIOUS}
+    assert results | {*EXPORTS} - {*FILMS} <= files
     assert len(files & {*FILMS}) == 1
     assert "checkpoint.safetensors" in os.listdir(fitted)
     assert sorted(os.listdir(fitted / "test")) == ["test_r_0.png", "test_r_1.png"]

@@ -44,10 +44,13 @@ def begin(out: Path, kind: str) -> Path:
 
 
 @contextmanager
-def replacing(out: Path, kind: str, all_former: bool = False, say: Say = say) -> Iterator[Path]:
+def replacing(
+    out: Path, kind: str, all_former: bool = False, keep_on_error: bool = False, say: Say = say
+) -> Iterator[Path]:
     """A hidden folder for new files, which take their places in `out` when the block ends; see `publish`.
 
-    `out` is created if it does not exist; after an error in the block it is as it was.
+    `out` is created if it does not exist; after an error in the block it is as it was, but for the hidden folder with
+    `keep_on_error`, which stays until the next call.
     """
     out.mkdir(parents=True, exist_ok=True)
     complete(out, say)
@@ -60,14 +63,15 @@ def replacing(out: Path, kind: str, all_former: bool = False, say: Say = say) ->
             yield work
             enter(work, kind)
         except BaseException:
-            shutil.rmtree(work, ignore_errors=True)
+            if not keep_on_error:
+                shutil.rmtree(work, ignore_errors=True)
             raise
         publish(work, out, all_former, say)
 
 
 def enter(work: Path, kind: str, names: Iterable[str] | None = None) -> None:
     """Enter files of a folder of new results in its marker, as they are now: these if they are there, or all."""
-    former = {name: shas for name, shas in read_marker(work).get(kind, {}).items() if (work / name).is_file()}
+    former = read_marker(work).get(kind, {})
     there = _files(work) if names is None else [name for name in names if (work / name).is_file()]
     _write_marker(work, {kind: former | {name: [_sha256(work / name)] for name in there}})
 

@@ -6,12 +6,10 @@ from pathlib import Path
 from kgs.errors import DataError
 from kgs.json_files import read_json
 
-from .outputs import EXPORTS
 from .publishing import discard, unpublished
 
 CHECKPOINT = "checkpoint.safetensors"
 PREVIOUS = "checkpoint.previous.safetensors"
-RESULTS = ("config.json", "metrics.json", "splat.ply", "curve.png", "index.html", *EXPORTS, CHECKPOINT, PREVIOUS)
 
 
 def is_finished(out: Path) -> bool:
