@@ -10,11 +10,12 @@ from kgs.errors import DataError
 from kgs.progress import ProgressBar
 
 from .gates import Pairs, focal_difference, focal_doubt, is_forward, judge, why_no_cameras
-from .leave_out import without_cameras, without_overlap
+from .leave_out import doubtful, without_cameras, without_overlap
 from .map import Cameras, pair_geometries, quiet_pycolmap, solve, verified
 from .match import exif_focals, lenses_of, write_matches
 from .pycolmap_processes import PycolmapProcesses
 from .read import Photo
+from .second_look import look_again, seen_well
 from .write import write_images
 
 SOLVERS = ("SIFT of OpenCV, AdaLAM of Kornia, COLMAP's mapper", "SIFT and matches of COLMAP, COLMAP's mapper")
@@ -81,10 +82,10 @@ def agreed_cameras(
         geometries = {pair: geometry for pair, geometry in geometries.items() if left_out.keys().isdisjoint(pair)}
         if reason := why_no_cameras(list(kept.values()), pairs, geometries):
             raise DataError(folder, "", reason)
-        solvers = _Solvers((first, second), second_matches, images, work, seed, exif_focals(photos), executor)
+        solvers = _Solvers((first, second), second_matches, images, work, seed, exif_focals(photos), executor, pairs)
         solutions, held = solvers.solve(kept)
-        while doubtful := without_cameras(solutions, list(kept.values()), pairs):
-            left_out |= doubtful
+        while unplaced := without_cameras(solutions, list(kept.values()), pairs):
+            left_out |= unplaced
             kept = {image: name for image, name in kept.items() if name not in left_out}
             solutions, held = solvers.solve(kept)
         lap("cameras")
@@ -114,27 +115,60 @@ class _Solvers:
     seed: int
     exif_focals: list[float | None]  # of each lens
     executor: ThreadPoolExecutor
+    pairs: Pairs
 
     def solve(self, names: Mapping[str, str]) -> tuple[list[Cameras | None], list[float]]:
         """What each solver finds, and the focal lengths of the Exif if the photos do not tell them, else [].
 
-        `names` are those of the photos to place, by those of their images.
+        Where photos would be left out, those that failed look again. `names` are those of the photos to place, by those
+        of their images.
         """
-        second = self.executor.submit(self._solve_second, names)
-        solutions = [self._solve(0, "first", names), second.result()]
+        free = self._both(lambda solver: self._solve(solver, names))
+        solutions, held = self._held_if_in_doubt(free, names)
+        if not doubtful(solutions, list(names.values()), self.pairs):
+            return solutions, held
+        again = self._look_again(free, names)
+        if any(new is not old for new, old in zip(again, free, strict=True)):
+            solutions, held = self._held_if_in_doubt(again, names)
+        return (self._look_again(solutions, names, held) if held else solutions), held
+
+    def _held_if_in_doubt(
+        self, solutions: list[Cameras | None], names: Mapping[str, str]
+    ) -> tuple[list[Cameras | None], list[float]]:
+        """The solutions, or those with the focal lengths of the Exif if these are known and the photos tell none."""
         placed = [cameras for cameras in solutions if cameras]
         known = [focal for focal in self.exif_focals if focal]
         is_known = len(known) == len(self.exif_focals)
         if not is_known or not placed or not (focal_doubt(placed) or focal_difference(placed)):
             return solutions, []
-        return [self._solve(solver, "held", names, known) for solver in (0, 1)], known
+        return self._both(lambda solver: self._solve(solver, names, known)), known
 
-    def _solve_second(self, names: Mapping[str, str]) -> Cameras | None:
-        self.second_matches.result()
-        return self._solve(1, "second", names)
+    def _look_again(
+        self, solutions: list[Cameras | None], names: Mapping[str, str], focals: Sequence[float] = ()
+    ) -> list[Cameras | None]:
+        """The solutions after a second look of the solvers that failed about a photo, or of both if they differ."""
+        photos = doubtful(solutions, list(names.values()), self.pairs)
+        well = [seen_well(cameras, photos) for cameras in solutions]
+        is_disputed = bool(well[0] & well[1])
 
-    def _solve(self, solver: int, work: str, names: Mapping[str, str], focals: Sequence[float] = ()) -> Cameras | None:
-        return solve(self.databases[solver], self.images, self.work / work, self.seed, names, focals)
+        def look(solver: int) -> Cameras | None:
+            found = solutions[solver]
+            if well[solver] == photos and not is_disputed:
+                return found
+            place = (self.databases[solver], self.images, self.work / f"again{solver}", self.seed)
+            return look_again(*place, names, focals, found, solutions[1 - solver], photos)
+
+        return self._both(look)
+
+    def _both(self, solve: Callable[[int], Cameras | None]) -> list[Cameras | None]:
+        """What a function finds for the first solver, and at the same time for the second."""
+        second = self.executor.submit(solve, 1)
+        return [solve(0), second.result()]
+
+    def _solve(self, solver: int, names: Mapping[str, str], focals: Sequence[float] = ()) -> Cameras | None:
+        if solver == 1:
+            self.second_matches.result()
+        return solve(self.databases[solver], self.images, self.work / f"mapper{solver}", self.seed, names, focals)
 
 
 def _lenses(photos: list[Photo], images: list[str]) -> list[tuple[list[str], str | None]]:

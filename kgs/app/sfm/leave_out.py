@@ -103,6 +103,22 @@ def without_cameras(solutions: Sequence[Cameras | None], names: Sequence[str], p
     first, second = solutions
     if first is None or second is None:
         return {}
+    # without photos that were placed badly the solvers may agree about the others
+    left = _placed_badly(first, second, names, pairs) or _disputed(first, second, list(names))
+    return left if len(names) - len(left) >= FEWEST else {}
+
+
+def doubtful(solutions: Sequence[Cameras | None], names: Sequence[str], pairs: Pairs) -> set[str]:
+    """Photos whose cameras cannot be trusted, also where too few others remain; all of them if a solver has none."""
+    first, second = solutions
+    if first is None or second is None:
+        return set(names)
+    left = _placed_badly(first, second, names, pairs)
+    return {*left, *_disputed(first, second, [name for name in names if name not in left])}
+
+
+def _placed_badly(first: Cameras, second: Cameras, names: Sequence[str], pairs: Pairs) -> dict[str, str]:
+    """The photos that a solver did not place, that see few points, or whose lens is disputed, and why."""
     left = dict[str, str]()
     for name in names:
         solvers = (name in first.points) + (name in second.points)
@@ -110,14 +126,12 @@ def without_cameras(solutions: Sequence[Cameras | None], names: Sequence[str], p
             who = "only one of two solvers" if solvers else "neither of two solvers"
             left[name] = f"{who} could place it{_advice(name, names, pairs)}"
     placed = [name for name in names if name not in left]
-    better = max((first, second), key=lambda cameras: _seen_well(cameras, placed))
+    better = max((first, second), key=lambda cameras: _well_seen(cameras, placed))
     for name in placed:
         if better.points[name] < FEWEST_POINTS:
             few = f"only {better.points[name]} points are seen in it, fewer than {FEWEST_POINTS}"
             left[name] = f"{few}{_advice(name, names, pairs)}"
-    left |= _other_lenses(first, second, [name for name in names if name not in left])
-    left |= _disputed(first, second, [name for name in names if name not in left])
-    return left if len(names) - len(left) >= FEWEST else {}
+    return left | _other_lenses(first, second, [name for name in names if name not in left])
 
 
 def _other_lenses(first: Cameras, second: Cameras, names: list[str]) -> dict[str, str]:
@@ -131,10 +145,7 @@ def _other_lenses(first: Cameras, second: Cameras, names: list[str]) -> dict[str
 
 
 def _disputed(first: Cameras, second: Cameras, names: list[str]) -> dict[str, str]:
-    """The photos without which both solvers agree about all pairs: at each turn that in most pairs they differ about.
-
-    Empty if not even three photos are left on which they agree.
-    """
+    """The photos without which both solvers agree about all pairs: at each turn the one in most pairs of doubt."""
     angles = {pair: angle_between(first, second, pair) for pair in combinations(names, 2)}
     left = dict[str, str]()
     while angles and max(angles.values()) > MOST_DEGREES:
@@ -143,10 +154,10 @@ def _disputed(first: Cameras, second: Cameras, names: list[str]) -> dict[str, st
         left[worst] = f"two solvers are {max(of_name[worst]):.3g} degrees apart about it"
         names = [name for name in names if name != worst]
         angles = {pair: angle for pair, angle in angles.items() if worst not in pair}
-    return left if len(names) >= FEWEST else {}
+    return left
 
 
-def _seen_well(cameras: Cameras, names: Sequence[str]) -> tuple[int, int]:
+def _well_seen(cameras: Cameras, names: Sequence[str]) -> tuple[int, int]:
     """How many photos see enough points, and how many the worst one sees."""
     counts = [cameras.points[name] for name in names]
     return sum(count >= FEWEST_POINTS for count in counts), min(counts, default=0)

@@ -75,9 +75,9 @@ def quiet_pycolmap() -> Iterator[Any]:
 
 
 def verified(database: Path, names: Mapping[str, str]) -> dict[tuple[str, str], int]:
-    """How many matches of every pair are verified, by the names that `names` gives the images of a database."""
+    """How many matches of every pair are verified, by the names that `names` gives images of a database."""
     with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database) as file:
-        images = {image.image_id: names[image.name] for image in file.read_all_images()}
+        images = {image.image_id: names[image.name] for image in file.read_all_images() if image.name in names}
         pairs = list(combinations(sorted(images), 2))
         return {(images[i], images[j]): len(_inliers(file, i, j)) for i, j in pairs}
 
@@ -119,7 +119,16 @@ def _is_forward(first: NDArray[np.float64], second: NDArray[np.float64], lens: A
 
 
 def solve(
-    database: Path, images: Path, work: Path, seed: int, names: Mapping[str, str], focals: Sequence[float] = ()
+    database: Path,
+    images: Path,
+    work: Path,
+    seed: int,
+    names: Mapping[str, str],
+    focals: Sequence[float] = (),
+    *,
+    first_pair: tuple[str, str] | None = None,
+    start: Cameras | None = None,
+    fewest: int = 0,
 ) -> Cameras | None:
     """Cameras and points from verified matches, of as many photos as can be placed; None if no pair can be.
 
@@ -127,25 +136,38 @@ def solve(
     that. This is repeated with the lenses that came out until they no longer change.
 
     Args:
-        database: with verified matches, and a first guess of each lens, which the result replaces.
+        database: with verified matches, and a first guess of each lens.
         images: the folder of the photos.
         work: a folder for what the mapper writes.
         seed: of its random choices.
         names: the names of the photos to place, by those of the images in the database.
         focals: the focal length of each lens in pixels if they are known; (): they are adjusted.
+        first_pair: the images in the database that are placed first; None: the mapper chooses.
+        start: cameras of other matches that are there before any photo is placed. Their points are computed anew, from
+            the matches of the database, and then the cameras are adjusted to these.
+        fewest: how many photos have to be placed; where the first round places fewer, the result is None.
     """
     best = None
     error = 0.0
     is_held = len(focals) > 0
     with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database) as file:
+        guesses = file.read_all_cameras()
         lenses = {lens.camera_id: lens for lens in file.read_all_cameras()}
         for camera_id, focal in zip(sorted(lenses), focals, strict=is_held):
             lenses[camera_id].focal_length = focal
-        for _ in range(_ROUNDS):
+        ids = {image.name: image.image_id for image in file.read_all_images()}
+        options = _mapper_options(pycolmap, list(names), seed)
+        if first_pair:
+            options.init_image_id1, options.init_image_id2 = (ids[image] for image in first_pair)
+            options.init_num_trials = 1
+        for _ in range(_ROUNDS if start is None else 1):
             for lens in lenses.values():
                 file.update_camera(lens)
-            scene = _map(pycolmap, database, images, work, list(names), seed, not is_held)
-            if scene is None or (best is not None and _is_worse(scene, best)):
+            if start is None:
+                scene = _map(pycolmap, database, images, work, options, not is_held)
+            else:
+                scene = _map_from(pycolmap, database, images, work, options, _started(file, start, names))
+            if scene is None or (best is not None and _is_worse(scene, best)) or scene.num_reg_images() < fewest:
                 break
             best, error = _adjust(scene, is_held)
             changes = [_change(lenses[camera_id], lens) for camera_id, lens in best.cameras.items()]
@@ -153,6 +175,8 @@ def solve(
                 lenses[camera_id].params = lens.params
             if max(changes) < _CONVERGED:
                 break
+        for lens in guesses:
+            file.update_camera(lens)
     if best is None:
         return None
     return cameras_of(best, names, math.inf if is_held else _focal_rise(best, error))
@@ -180,13 +204,10 @@ def cameras_of(reconstruction: Any, names: Mapping[str, str], focal_rise: float)
     )
 
 
-def _map(pycolmap: Any, database: Path, images: Path, work: Path, names: list[str], seed: int, free: bool) -> Any:
-    """The reconstruction of most photos with the lenses of the database; None if no pair can be placed.
-
-    If `free`, the second attempt adjusts focal lengths while it places photos.
-    """
+def _mapper_options(pycolmap: Any, images: list[str], seed: int) -> Any:
+    """The settings with which the mapper places these images of a database."""
     options = pycolmap.IncrementalPipelineOptions()
-    options.image_names = names
+    options.image_names = images
     options.num_threads = options.mapper.num_threads = 1
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
     options.multiple_models = False
@@ -202,7 +223,16 @@ def _map(pycolmap: Any, database: Path, images: Path, work: Path, names: list[st
     options.mapper.init_max_error = 2.0
     options.mapper.abs_pose_max_error = 4.0
     options.triangulation.ignore_two_view_tracks = False  # of three photos, most points are seen by two
+    return options
+
+
+def _map(pycolmap: Any, database: Path, images: Path, work: Path, options: Any, free: bool) -> Any:
+    """The reconstruction of most photos with the lenses of the database; None if no pair can be placed.
+
+    If `free`, the second attempt adjusts focal lengths while it places photos.
+    """
     options.mapper.init_min_tri_angle = _FIRST_PAIR_DEGREES
+    options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = False
     scene = _run_mapper(pycolmap, database, images, work, options)
     if scene is None:
         options.mapper.init_min_tri_angle = _FIRST_PAIR_DEGREES_AGAIN
@@ -211,10 +241,35 @@ def _map(pycolmap: Any, database: Path, images: Path, work: Path, names: list[st
     return scene
 
 
-def _run_mapper(pycolmap: Any, database: Path, images: Path, work: Path, options: Any) -> Any:
-    """The reconstruction that places most photos; None if the mapper finds none."""
+def _map_from(pycolmap: Any, database: Path, images: Path, work: Path, options: Any, start: Any) -> Any:
+    """The reconstruction of the photos whose cameras are known, and of those that its points then place."""
+    known = work / "start"
+    known.mkdir(parents=True, exist_ok=True)
+    points = pycolmap.triangulate_points(start, database, images, known, options=options)
+    points.write_binary(known)
+    return _run_mapper(pycolmap, database, images, work, options, known)
+
+
+def _started(file: Any, cameras: Cameras, names: Mapping[str, str]) -> Any:
+    """A reconstruction with these cameras and the keypoints of a database, without points."""
+    with quiet_pycolmap() as pycolmap:
+        scene = pycolmap.Reconstruction()
+        images = {image.name: image for image in file.read_all_images()}
+        for lens in cameras.reconstruction.cameras.values():
+            scene.add_camera_with_trivial_rig(lens)
+        for image in cameras.reconstruction.images.values():
+            if image.has_pose and names.get(image.name) in cameras.rotations:
+                image_id = images[image.name].image_id
+                places = file.read_keypoints(image_id)[:, :2]
+                new = pycolmap.Image(name=image.name, keypoints=places, camera_id=image.camera_id, image_id=image_id)
+                scene.add_image_with_trivial_frame(new, image.cam_from_world())
+    return scene
+
+
+def _run_mapper(pycolmap: Any, database: Path, images: Path, work: Path, options: Any, start: str | Path = "") -> Any:
+    """The reconstruction that places most photos; None if the mapper finds none. It goes on with the one in `start`."""
     try:
-        scenes = pycolmap.incremental_mapping(database, images, work, options)
+        scenes = pycolmap.incremental_mapping(database, images, work, options, start)
     except (RuntimeError, ValueError):  # the mapper gives up
         check_space(database.parent)
         return None
