@@ -67,6 +67,7 @@ def test_three_photos_remain_and_more_than_in_any_other_group():
         (cameras(), cameras(turned={"d": 2 * MOST_DEGREES}), "d", "4 degrees apart"),
         (cameras(), cameras(turned={"d": 40.0, "e": 80.0}), "de", "degrees apart"),
         (cameras(), cameras(turned={"d": 0.9 * MOST_DEGREES}), "", ""),
+        (cameras(NAMES[1:]), cameras(NAMES[1:], turned={"d": 40.0}), "a", "neither"),  # d is looked at without a
         (cameras(), cameras(turned={n: 10.0 * i for i, n in enumerate(NAMES)}), "", ""),  # no three agree
         (cameras(NAMES[:4]), cameras(NAMES[2:]), "", ""),  # two would remain
         (cameras(focals={"e": 1200.0}), cameras(focals={"e": 1600.0}), "e", "factor of 1.33 about the focal length"),

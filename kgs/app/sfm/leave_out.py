@@ -2,8 +2,8 @@
 
 A photo is left out if it is a copy, or of another shape than most while no Exif says its focal length; if it shows
 another place, or the same from the same place as another one; or if its camera cannot be trusted: each solver has to
-place it, it has to see enough points, and both have to agree about it and its lens. At least three photos remain, or
-nothing is left out and the gates refuse all.
+place it, it has to see enough points, and both have to agree about it and its lens, if need be at a second look
+(:mod:`kgs.app.sfm.second_look`). At least three photos remain, or nothing is left out and the gates refuse all.
 """
 
 from collections.abc import Mapping, Sequence
@@ -126,7 +126,7 @@ def _placed_badly(first: Cameras, second: Cameras, names: Sequence[str], pairs: 
             who = "only one of two solvers" if solvers else "neither of two solvers"
             left[name] = f"{who} could place it{_advice(name, names, pairs)}"
     placed = [name for name in names if name not in left]
-    better = max((first, second), key=lambda cameras: _well_seen(cameras, placed))
+    better = max((first, second), key=lambda cameras: _seen_well(cameras, placed))
     for name in placed:
         if better.points[name] < FEWEST_POINTS:
             few = f"only {better.points[name]} points are seen in it, fewer than {FEWEST_POINTS}"
@@ -145,7 +145,10 @@ def _other_lenses(first: Cameras, second: Cameras, names: list[str]) -> dict[str
 
 
 def _disputed(first: Cameras, second: Cameras, names: list[str]) -> dict[str, str]:
-    """The photos without which both solvers agree about all pairs: at each turn the one in most pairs of doubt."""
+    """The photos without which both solvers agree about all pairs: at each turn that in most pairs they differ about.
+
+    Fewer than three may be left.
+    """
     angles = {pair: angle_between(first, second, pair) for pair in combinations(names, 2)}
     left = dict[str, str]()
     while angles and max(angles.values()) > MOST_DEGREES:
@@ -157,7 +160,7 @@ def _disputed(first: Cameras, second: Cameras, names: list[str]) -> dict[str, st
     return left
 
 
-def _well_seen(cameras: Cameras, names: Sequence[str]) -> tuple[int, int]:
+def _seen_well(cameras: Cameras, names: Sequence[str]) -> tuple[int, int]:
     """How many photos see enough points, and how many the worst one sees."""
     counts = [cameras.points[name] for name in names]
     return sum(count >= FEWEST_POINTS for count in counts), min(counts, default=0)
