@@ -1,4 +1,4 @@
-"""Cameras of real photos whose poses are known, in sets of six and in whole folders: how many are placed, how well."""
+"""Cameras of real photos, in sets of six and in whole folders: how many are placed, and how far off they are."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -36,7 +36,8 @@ def cameras(*, out: Path, beside: tuple[Path, ...] = (), processes: int | None =
     For example:
       KGS_DATA=SCENES python real.py --out cameras --processes 1
 
-    Needs the extra sfm, too. Writes sets.jsonl and sets.md.
+    Needs the extra sfm, too. Writes sets.jsonl and sets.md. "Degrees off" is the worst rotation of a pair against given
+    poses, or, for parts of a folder without them, against those that were found of all its photos together.
 
     Args:
         out: folder for the results; sets that its sets.jsonl has are not repeated.
@@ -93,7 +94,8 @@ def write_sets(versions: Mapping[str, Sequence[Mapping[str, Any]]], out: Path) -
             last = cell["first"] + cell["step"] * (result["given"] - 1)
             name = f"{cell['folder']} {cell['first']}-{last}" + (f" by {cell['step']}" if cell["step"] > 1 else "")
             given[name] = result["given"]
-            columns[version][name] = _columns(result, known[cell["folder"]])
+            is_measure = not cell["photos"] and not FOLDERS[cell["folder"]][1]
+            columns[version][name] = _columns(result, {} if is_measure else known[cell["folder"]])
     heads = ["photos", *(f"{head}, {version}" for version in versions for head in HEADS)]
     lines = [
         [name, count, *(cell for rows in columns.values() for cell in rows.get(name, [""] * len(HEADS)))]

@@ -15,7 +15,9 @@ from pathlib import Path
 from .gates import FEWEST_POINTS
 from .map import Cameras, solve, verified
 
-_TRIES = 4  # other first pairs
+_FEWEST_TRIES = 2  # with other first pairs
+_MOST_TRIES = 4
+_PLACINGS = 48  # of photos in all tries together, if that leaves as many tries: each places all photos
 
 
 def look_again(
@@ -47,7 +49,8 @@ def look_again(
     photos = list(names.values())
     best = found
     were_placed = len(seen_well(found, photos)) == len(photos)
-    for number, pair in enumerate(_first_pairs(database, names, doubtful)[:_TRIES], 1):
+    tries = min(_MOST_TRIES, max(_FEWEST_TRIES, _PLACINGS // len(photos)))
+    for number, pair in enumerate(_first_pairs(database, names, doubtful)[:tries], 1):
         fewest = min(len(seen_well(best, photos)) + 1, len(photos))
         cameras = solve(database, images, work, seed + number, names, focals, first_pair=pair, fewest=fewest)
         best = _better(best, cameras, photos)
