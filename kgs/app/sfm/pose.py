@@ -38,7 +38,7 @@ from .read import FILM_DIAGONAL, OpenPhoto, Photo, blurred, open_photos, read_ph
 from .video import take_frames
 from .write import level_and_scale, upright, write_images, write_masks, write_model
 
-SETTINGS = 8  # increased by every change after which the same photos give other files
+SETTINGS = 9  # increased by every change after which the same photos give other files
 
 
 def pose_photos(
