@@ -15,7 +15,7 @@ from kgs.app.files.cameras import as_taken
 from kgs.app.files.figures import write_curve
 from kgs.app.files.locks import locked
 from kgs.app.files.outputs import check_folder, png_names, write_png
-from kgs.app.files.publishing import begin, complete, enter, publish, replacing, unpublished
+from kgs.app.files.publishing import begin, complete, discard, enter, publish, replacing, unpublished
 from kgs.app.files.results_folder import (
     CHECKPOINT,
     PREVIOUS,
@@ -133,7 +133,7 @@ def fit_folder(
                 notes.say_new()
                 say(f"{printable(new)}: holds the results that could be written")
             elif not trainer.saved:
-                discard_fit(work)
+                discard_fit(work, say)
             raise
         folder = out
         is_done = trainer.step >= plan.times.steps
@@ -143,11 +143,14 @@ def fit_folder(
             trainer.state.note(f"{kept}, where a resumed fit goes on")
         else:
             others = {other: step_of(other) for other in unpublished(out, "fit") if other != work}
-            photos = unpublished(out, "photos") if request.scene == "." else []
-            publish(work, out, all_former=True, say=say, along=photos)
+            root = Path(scene.root).resolve()
+            own = [photos for photos in unpublished(out, "photos") if photos.resolve() == root]
+            publish(work, out, all_former=True, say=say, along=own)
             for other, step in others.items():
                 if is_done or step <= trainer.step:
-                    discard_fit(other)
+                    discard_fit(other, say)
+            for photos in () if unpublished(out, "fit") else unpublished(out, "photos"):
+                discard(photos, say=say)  # no fit waits for them any more
         notes.say_new()
         if page is not None:
             how = f"was stopped at step {trainer.step}" if stopped_by else "is done"

@@ -52,7 +52,7 @@ def test_another_file_of_this_name_is_kept(splat: Path, tmp_path: Path, capsys: 
     else:
         (tmp_path / "a.ply").write_bytes(b"other")
     assert run("export", splat, "-o", tmp_path / "a.ply") == 0
-    assert "is now kept/a.ply" in capsys.readouterr().out
+    assert "moved to kept/a.ply, because" in capsys.readouterr().out
     assert (tmp_path / "kept" / "a.ply").read_bytes() == b"other"
     assert len(decode(tmp_path / "a.ply")["means"]) == 300
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import subprocess
@@ -16,7 +17,8 @@ from typing import Any
 import pytest
 from command import run
 
-from kgs.app.files.publishing import MARKER, begin, complete, discard, enter, is_own, publish, read_marker
+from kgs.app.files import publishing
+from kgs.app.files.publishing import MARKER, begin, complete, discard, enter, is_own, publish, read_marker, unpublished
 from kgs.app.files.publishing import replacing as replacing_files
 from kgs.json_files import write_json
 
@@ -71,13 +73,13 @@ def test_some_results_take_the_place_of_their_namesakes_alone(out: Path) -> None
 def test_what_is_changed_is_kept_and_said(out: Path) -> None:
     write(out, {"a.txt": "mine", "test/1.txt": "mine", "notes.txt": "mine"})
     (line,) = replace_all(out, NEW)
-    assert line == f"{out}: what was there and not as kgs wrote it is now kept/a.txt"
+    assert line.startswith(f"{out}: moved to kept/a.txt, because this command did not write it")
     # test/1.txt is no result any more: it is the user's, and in nobody's way
     mine = {"kept/a.txt": "mine", "test/1.txt": "mine", "notes.txt": "mine"}
     assert contents(out) == NEW | mine
     write(out, {"a.txt": "mine again", "test/0.txt": "mine"})
     (line,) = replace_all(out, OLD)
-    assert line.endswith("is now kept-2/a.txt, kept/test/0.txt, kept/test/1.txt")
+    assert "moved to kept-2/a.txt, kept/test/0.txt, kept/test/1.txt, because" in line
     kept = {"a.txt": "mine", "test/0.txt": "mine", "test/1.txt": "mine"}
     assert contents(out / "kept") == kept
     assert contents(out / "kept-2") == {"a.txt": "mine again"}
@@ -205,13 +207,17 @@ def test_unfinished_work_gets_a_name_that_nobody_has(tmp_path: Path) -> None:
     assert begin(tmp_path, "fit").name == "unfinished-4"
 
 
-def test_what_the_user_changed_in_unfinished_work_stays(tmp_path: Path) -> None:
+def test_what_the_user_has_in_unfinished_work_stays(tmp_path: Path) -> None:
     work = begin(tmp_path, "fit")
     write(work, {"config.json": "{}", "test/0.png": "kgs"})
     enter(work, "fit")
-    write(work, {"config.json": "mine"})
-    discard(work)
-    assert contents(tmp_path) == {"unfinished-1/config.json": "mine"}
+    mine = {"config.json": "mine", "a.tmp": "mine", "b.partial": "mine", "c.tmp/d": "mine", "checkpoint/e": "mine"}
+    write(work, mine)
+    lines: list[str] = []
+    discard(work, ["checkpoint"], lines.append)
+    assert contents(work) == mine
+    (line,) = lines
+    assert line.startswith(f"{work}: what is left there is not of kgs")
 
 
 def test_publishing_leaves_what_the_user_put_beside_it(out: Path) -> None:
@@ -282,7 +288,7 @@ def test_a_kill_at_any_call_leaves_old_or_new_results(
             except KeyboardInterrupt:
                 pass
         complete(out)
-        for work in out.glob("unfinished-*"):
+        for work in (*unpublished(out, "demo"), *unpublished(out, "photos")):
             discard(work, list(NEW))
         complete(out)
         now = contents(out)
@@ -315,6 +321,78 @@ def test_a_damaged_marker_names_nothing(out: Path, content: str) -> None:
     assert not is_own(out, "a.txt")
     replace_all(out, {"a.txt": "new"})
     assert contents(out) == OLD | {"a.txt": "new", "kept/a.txt": "old"}
+
+
+@pytest.mark.parametrize(
+    "name", [".kgs-notes", ".kgs-venv", "unfinished-1-backup", "unfinished-x", "unfinished-2026-01-05", "unfinished-01"]
+)
+def test_folders_that_are_only_called_like_those_of_kgs_stay(out: Path, name: str) -> None:
+    """Also copies of such, with the marker in them."""
+    work = begin(out, "demo")
+    write(work, {"a.txt": "new"})
+    enter(work, "demo")
+    work.rename(out / name)
+    (out / f"{name}-empty").mkdir()
+    replace_all(out, NEW)
+    assert contents(out / name) == {"a.txt": "new"}
+    assert (out / f"{name}-empty").is_dir()
+    assert unpublished(out, "demo") == []
+
+
+def test_a_marker_that_is_a_link_is_replaced(out: Path, tmp_path: Path) -> None:
+    """As in a farm of links: the other folder's marker stays."""
+    farm = tmp_path / "farm"
+    farm.mkdir()
+    (farm / MARKER).symlink_to(out / MARKER)
+    before = (out / MARKER).read_bytes()
+    replace_all(farm, NEW)
+    assert (out / MARKER).read_bytes() == before
+    assert not (farm / MARKER).is_symlink()
+    assert all(is_own(farm, name) for name in NEW)
+
+
+@pytest.mark.parametrize("name", [MARKER, f"{MARKER}/notes.txt"])
+def test_what_is_in_the_place_of_the_marker_is_kept(
+    tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write(tmp_path, {name: '{"my": "notes"}'})
+    for files in (OLD, NEW):
+        replace_all(tmp_path, files)
+    assert (tmp_path / "kept" / name).read_text() == '{"my": "notes"}'
+    assert f"moved to kept/{MARKER}" in capsys.readouterr().out
+    assert contents(tmp_path).items() >= NEW.items()
+
+
+def test_a_folder_that_cannot_be_written_to_is_left_as_it_is(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands that only read open it, and go on."""
+    work = begin(out, "demo")
+    write(work, NEW)
+    enter(work, "demo")
+    with monkeypatch.context() as patch, suppress(KeyboardInterrupt):
+        patch.setattr(publishing, "complete", partial(kill, KeyboardInterrupt()))
+        publish(work, out, all_former=True)
+    with monkeypatch.context() as patch:
+        patch.setattr(publishing, "held", partial(kill, OSError(errno.EROFS, "Read-only file system")))
+        complete(out)
+    assert {name: text for name, text in contents(out).items() if "/" not in name} == {"a.txt": "old"}
+    complete(out)
+    assert contents(out) == NEW
+
+
+def kill(error: BaseException, *_: Any, **__: Any) -> None:
+    raise error
+
+
+def test_where_there_are_no_locks_no_folder_is_taken_for_an_abandoned_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("fcntl")
+    monkeypatch.setattr("fcntl.flock", partial(kill, OSError(errno.ENOLCK, "No locks available")))
+    with replacing_files(tmp_path, "page") as outer:
+        with replacing_files(tmp_path, "page") as inner:
+            write(inner, {"b.html": "new"})
+        write(outer, {"a.html": "new"})
+    assert contents(tmp_path) == {"a.html": "new", "b.html": "new"}
 
 
 @pytest.mark.parametrize("move", ["all", {}, {"along": ["..", "a.txt", "none"]}])

@@ -28,6 +28,7 @@ def evaluate(
         device: cpu, cuda, ...
         backend: auto: that of the fit. kgs fit --help-all describes the others.
     """
+    from kgs.app.files.locks import locked
     from kgs.app.files.publishing import replacing
     from kgs.app.page.fit_page import PAGE, write_own_page
     from kgs.app.saved_fit import load_fit
@@ -41,9 +42,9 @@ def evaluate(
     request, fit = load_fit(out, device, backend, say)
     path = out / "metrics.json"
     metrics = measure_again(path, fit.metrics, fit.scene, fit.render, lpips)
-    if read_json(path) != fit.metrics:
-        raise DataError(out, "", "a new fit took the place of the one that was measured: measure again")
-    with replacing(out, "fit") as new:
+    with locked(out), replacing(out, "fit") as new:
+        if read_json(path) != fit.metrics:
+            raise DataError(out, "", "a new fit took the place of the one that was measured: measure again")
         write_json(new / path.name, metrics)
         write_own_page(new, out, replace(fit, metrics=metrics), request, config=out / "config.json")
     say(as_text(metrics))

@@ -9,10 +9,11 @@ from kgs.errors import DataError
 
 
 @contextmanager
-def held(path: Path, wait: bool = False) -> Iterator[bool]:
+def held(path: Path, wait: bool = False, unknown: bool = True) -> Iterator[bool]:
     """Lock a file, created if missing, until the block or the process ends.
 
-    Yields False if another one holds the lock; with `wait` the block begins when it is free.
+    Yields False if another one holds the lock, and `unknown` on a file system without locks; with `wait` the block
+    begins when it is free.
     """
     with open(path, "ab") as file:
         ours = True
@@ -29,7 +30,7 @@ def held(path: Path, wait: bool = False) -> Iterator[bool]:
         except (BlockingIOError, PermissionError):
             ours = False
         except OSError:
-            pass  # a file system without locks
+            ours = unknown
         yield ours
 
 

@@ -5,12 +5,14 @@ results are written to a folder of their own below it, which has a marker, too. 
 after a kill the next command that opens the folder ends the move (`complete`).
 """
 
+import errno
 import hashlib
 import os
+import re
 import shutil
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from itertools import chain, count
 from pathlib import Path, PurePath
 from typing import Any
@@ -23,11 +25,11 @@ from .locks import held
 
 MARKER = ".kgs.json"
 KEPT = "kept"
-_UNFINISHED = "unfinished-"  # and a number: a folder of new results that outlives its process
-_HIDDEN = ".kgs-"  # and a random name: one that does not
+_UNFINISHED = re.compile(r"unfinished-[1-9]\d*")  # folders of new results that outlive their process
+_HIDDEN = re.compile(r"\.kgs-[0-9a-f]{32}")  # those that do not
+_TEMPORARY = re.compile(r"\.kgs-[0-9a-f]{32}\.tmp")  # files of `write_whole`, which a kill leaves
 _LOCK = ".lock"
 _MARKER_LOCK = ".kgs.lock"
-_TEMPORARY = (".partial", ".tmp")
 _MOST_NAMED = 10  # files in a line
 Hashes = dict[str, list[str]]  # of each file that kgs wrote; two where new results are about to replace former ones
 Say = Callable[[str], None]
@@ -37,9 +39,10 @@ def begin(out: Path, kind: str) -> Path:
     """Make a folder for new results in `out`: `unfinished-1`, or the next number whose name is free."""
     out.mkdir(parents=True, exist_ok=True)
     with _marker_lock(out):
-        work = next(path for number in count(1) if not os.path.lexists(path := out / f"{_UNFINISHED}{number}"))
-        work.mkdir()
-        _write_marker(work, {kind: {}})
+        hidden = _make_hidden(out)
+        _write_marker(hidden, {kind: {}})
+        work = next(path for number in count(1) if not os.path.lexists(path := out / f"unfinished-{number}"))
+        os.rename(hidden, work)  # with its marker: without one it would be the user's
     return work
 
 
@@ -56,15 +59,16 @@ def replacing(
     complete(out, say)
     with ExitStack() as lock:
         with _marker_lock(out):
-            work = out / f"{_HIDDEN}{uuid.uuid4().hex}"
-            work.mkdir()
+            work = _make_hidden(out)
             lock.enter_context(held(work / _LOCK))
         try:
             yield work
             enter(work, kind)
-        except BaseException:
+        except BaseException as error:
             if not keep_on_error:
                 shutil.rmtree(work, ignore_errors=True)
+                if isinstance(error, OSError) and error.filename:  # of a file that is gone
+                    error.filename = str(error.filename).replace(str(work), str(out))
             raise
         publish(work, out, all_former, say)
 
@@ -94,10 +98,16 @@ def publish(work: Path, out: Path, all_former: bool, say: Say = say, along: Iter
 
 
 def complete(out: Path, say: Say = say) -> None:
-    """End moves that a kill stopped, and remove hidden folders of processes that are gone."""
-    if not _works(out):
+    """End moves that a kill stopped, and remove hidden folders of processes that are gone; not where none can write."""
+    if not any(_HIDDEN.fullmatch(work.name) or "move" in _read(work) for work in _works(out)):
         return
-    with _marker_lock(out):
+    with ExitStack() as lock:
+        try:
+            lock.enter_context(_marker_lock(out))
+        except OSError as error:
+            if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+                return
+            raise
         for work in _works(out):
             move = _read(work).get("move")
             if isinstance(move, dict):
@@ -105,34 +115,36 @@ def complete(out: Path, say: Say = say) -> None:
                     if other.name in move.get("along", ()):
                         _move(other, out, True, say)
                 _move(work, out, bool(move.get("all_former")), say)
-            elif work.name.startswith(_HIDDEN):
-                with held(work / _LOCK) as is_left:
+            elif _HIDDEN.fullmatch(work.name):
+                with held(work / _LOCK, unknown=False) as is_left:
                     if is_left:
                         shutil.rmtree(work, ignore_errors=True)
-            elif not (work / MARKER).exists():
-                with suppress(OSError):  # the user's, unless it is empty: a kill came before or after its marker
-                    work.rmdir()
 
 
 def unpublished(out: Path, kind: str) -> list[Path]:
     """The folders of new results of a kind in `out` that outlived their process, in the order of their numbers."""
-    works = [work for work in _works(out) if not work.name.startswith(_HIDDEN)]
-    return sorted((work for work in works if kind in read_marker(work)), key=lambda work: (len(work.name), work.name))
+    works = [work for work in _works(out) if _UNFINISHED.fullmatch(work.name) and kind in read_marker(work)]
+    return sorted(works, key=lambda work: (len(work.name), work.name))
 
 
-def discard(work: Path, names: Sequence[str] = ()) -> None:
+def discard(work: Path, names: Sequence[str] = (), say: Say = say) -> None:
     """Remove what kgs wrote in a folder of new results, `names` included, and the folder if nothing else is in it."""
     complete(work)
     entered = [name for files in read_marker(work).values() for name in files]
     own = [name for name in entered if is_own(work, name)]
-    temporary = [path.name for path in work.iterdir() if path.suffix in _TEMPORARY]
+    temporary = [path.name for path in work.iterdir() if _TEMPORARY.fullmatch(path.name)]
     for name in (*own, *names, *temporary, _LOCK, _MARKER_LOCK):
-        (work / name).unlink(missing_ok=True)
+        if not (work / name).is_dir():
+            (work / name).unlink(missing_ok=True)
     for name in (*entered, *names):
         _remove_empty((work / name).parent, work)
-    (work / MARKER).unlink(missing_ok=True)
-    with suppress(OSError):  # files of the user stay
-        work.rmdir()
+    if any(path.name != MARKER for path in work.iterdir()):
+        (work / MARKER).unlink(missing_ok=True)
+        say(f"{printable(work)}: what is left there is not of kgs, and stays")
+    else:
+        hidden = work.with_name(f".kgs-{uuid.uuid4().hex}")
+        os.rename(work, hidden)  # a kill leaves either of them
+        shutil.rmtree(hidden, ignore_errors=True)
 
 
 def clear(out: Path, names: Iterable[str], kind: str, say: Say = say) -> None:
@@ -141,7 +153,8 @@ def clear(out: Path, names: Iterable[str], kind: str, say: Say = say) -> None:
     blocked = [path for name in names if (path := _in_the_way(out, name, own.get(name, ()))) is not None]
     kept = [_keep(out, path) for path in dict.fromkeys(blocked)]
     if kept:
-        say(f"{printable(out)}: what was there and not as kgs wrote it is now {listed(kept, _MOST_NAMED)}")
+        reason = "because this command did not write it, or it was changed since"
+        say(f"{printable(out)}: moved to {listed(kept, _MOST_NAMED)}, {reason}")
 
 
 def is_own(folder: Path, name: str) -> bool:
@@ -168,8 +181,20 @@ def _read(folder: Path) -> dict[str, Any]:
 
 
 def _write_marker(folder: Path, entries: dict[str, Hashes]) -> None:
-    """Put entries in place of the former ones of their kinds."""
-    write_json(folder / MARKER, {"files": read_marker(folder) | entries})
+    """Put entries in place of the former ones of their kinds. A link is not followed, and what is no marker is kept."""
+    path = folder / MARKER
+    content = {"files": read_marker(folder) | entries}
+    if os.path.lexists(path) and "files" not in _read(folder):
+        say(f"{printable(folder)}: moved to {_keep(folder, path)}, because it is no marker of kgs")
+    if path.is_symlink():
+        path.unlink()
+    write_json(path, content)
+
+
+def _make_hidden(out: Path) -> Path:
+    work = out / f".kgs-{uuid.uuid4().hex}"
+    work.mkdir()
+    return work
 
 
 def _marker_lock(out: Path) -> AbstractContextManager[bool]:
@@ -179,8 +204,12 @@ def _marker_lock(out: Path) -> AbstractContextManager[bool]:
 
 def _works(out: Path) -> list[Path]:
     """The folders of new results in a folder."""
-    found = [path for prefix in (_UNFINISHED, _HIDDEN) for path in out.glob(f"{prefix}*")]
-    return [path for path in sorted(found) if path.is_dir() and not path.is_symlink()]
+    found = [path for path in (*out.glob("unfinished-*"), *out.glob(".kgs-*")) if path.is_dir()]
+    return [
+        path
+        for path in sorted(found)
+        if not path.is_symlink() and (_UNFINISHED.fullmatch(path.name) or _HIDDEN.fullmatch(path.name))
+    ]
 
 
 def _move(work: Path, out: Path, all_former: bool, say: Say) -> None:
@@ -199,7 +228,10 @@ def _move(work: Path, out: Path, all_former: bool, say: Say) -> None:
             (out / name).unlink(missing_ok=True)
             _remove_empty((out / name).parent, out)
     _write_marker(out, {kind: new if all_former else former | new})
-    discard(work)
+    if _HIDDEN.fullmatch(work.name):
+        shutil.rmtree(work, ignore_errors=True)
+    else:
+        discard(work, say=say)
 
 
 def _keep(out: Path, path: Path) -> str:
@@ -226,8 +258,8 @@ def _in_the_way(folder: Path, name: str, own: Iterable[str]) -> Path | None:
 
 def _files(folder: Path) -> list[str]:
     """The files of a folder of new results and its subfolders."""
-    files = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.suffix not in _TEMPORARY]
-    return [path.relative_to(folder).as_posix() for path in files if path.name not in (MARKER, _LOCK, _MARKER_LOCK)]
+    files = [path.relative_to(folder) for path in sorted(folder.rglob("*")) if path.is_file()]
+    return [path.as_posix() for path in files if path.as_posix() not in (MARKER, _LOCK, _MARKER_LOCK)]
 
 
 def _sha256(path: Path) -> str:

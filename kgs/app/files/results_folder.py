@@ -1,5 +1,6 @@
 """The files of a fit, and which of several fits in a folder is the furthest."""
 
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -41,6 +42,6 @@ def resumable_fits(out: Path) -> list[Path]:
     return sorted(found, key=step_of, reverse=True)
 
 
-def discard_fit(work: Path) -> None:
+def discard_fit(work: Path, say: Callable[[str], None]) -> None:
     """Remove a fit that was not published; files that kgs does not know stay."""
-    discard(work, (CHECKPOINT, PREVIOUS))
+    discard(work, (CHECKPOINT, PREVIOUS, f"{CHECKPOINT}.partial"), say)

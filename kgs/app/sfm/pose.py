@@ -21,7 +21,7 @@ from kgs.app.files.publishing import begin, complete, discard, publish, replacin
 from kgs.app.files.results_folder import resumable_fits
 from kgs.datasets.image_file import color_notes
 from kgs.datasets.masks import mask_folder
-from kgs.errors import DataError
+from kgs.errors import DataError, printable
 from kgs.json_files import read_json, write_json
 from kgs.machine import versions
 from kgs.progress import ProgressBar, silent
@@ -110,8 +110,8 @@ def pose_photos(
     out.mkdir(parents=True, exist_ok=True)
     with locked(out):
         complete(out, say)
-        waiting = unpublished(out, "photos")
-        posed = next((place for place in (*waiting, out) if is_reusable(place, inputs)), None)
+        places = (*unpublished(out, "photos"), out)
+        posed = next((place for place in places if is_reusable(place, inputs)), None)
         is_reused = posed is not None
         if posed is None:
             posed = begin(out, "photos")
@@ -122,10 +122,7 @@ def pose_photos(
                 discard(posed)
                 raise
         else:
-            say(f"cameras: those in {posed} are of the same {len(paths)} photos and are used again")
-        for other in waiting:
-            if other != posed:
-                discard(other)
+            say(f"cameras: those in {printable(posed)} are of the same {len(paths)} photos and are used again")
         if posed != out and not (wait and resumable_fits(out)):
             publish(posed, out, all_former=True, say=say)
             posed = out
