@@ -4,7 +4,7 @@ from typing import Any
 
 from kgs.machine import peak_rss_mb, versions
 from kgs.metrics.coverage import measure_coverage
-from kgs.metrics.evaluate import evaluate
+from kgs.metrics.evaluate import evaluate, views_to_recolor
 from kgs.metrics.lpips import Lpips
 
 from .fit import Fit
@@ -62,10 +62,12 @@ def measure(fit: Fit, lpips: Lpips | None = None) -> dict[str, Any]:
         poses += ", those of the training views refined by the fit"
     everywhere = all(views.counted is None for views in (scene.train, scene.test))
     pixels = "all pixels" if everywhere else "the pixels that count; SSIM and LPIPS take the others as equal"
-    is_exposed = scene.train.gains is not None and len(scene.test) > 0
+    recolored = {}
+    if scene.train.gains is not None and len(scene.test):
+        recolored["recolored"] = evaluate(fit.render, views_to_recolor(scene), lpips, recolor=True)
     return {
         "test": evaluate(fit.render, scene.test, lpips) if len(scene.test) else None,
-        **({"recolored": evaluate(fit.render, scene.test, lpips, recolor=True)} if is_exposed else {}),
+        **recolored,
         "train": evaluate(fit.render, scene.train, lpips),
         "seen": measure_coverage(scene, fit.render, fit.median_depth),
         **fit.history,

@@ -10,6 +10,7 @@ Field Rendering", SIGGRAPH 2023: an 11-tap Gaussian window of deviation 1.5, a b
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
@@ -35,12 +36,11 @@ def evaluate(
 ) -> dict[str, Any]:
     """Render each view from its camera, to `(1, 3, H, W)`, and compare it with its photo; no gradients are kept.
 
-    `render` is called with a camera. Where views have gains, or masks and `recolor`, it is also called with gains, as
-    :meth:`kgs.fit.Fit.render` takes them.
+    `render` is called with a camera and, where views have gains, with gains, as :meth:`kgs.fit.Fit.render` takes them.
 
     With `recolor`, each channel of a render first gets the gain and the offset that fit it best to the photo: what
-    exposure and white balance of a held-out photo do is then not counted. Where masks let a background show through,
-    only the colours of the scene get them.
+    exposure and white balance of a held-out photo do is then not counted. Where views have gains, and masks let a
+    background show through, only the colours of the scene get them.
 
     Views have at least 6 x 6 pixels, 16 x 16 with `lpips`, a network on the device of the renders. A ValueError for a
     render that differs in shape from its photo or holds NaN or infinity.
@@ -65,7 +65,7 @@ def evaluate(
         if recolor:
             counted = None if views.counted is None else views.counted[index]
             through = None
-            if views.masks is not None:
+            if views.masks is not None and views.gains is not None:
                 through = Through(render(views.camera(index), torch.zeros(3)), views.masks[index].to(image))
                 if views.transmittance is not None:  # the border darkens the background, too
                     counted = (views.transmittance >= 1) & (True if counted is None else counted)
@@ -77,6 +77,12 @@ def evaluate(
     if views.counted is not None and shares:
         means["counted"] = round(fmean(shares), 4)
     return {**means, "views": [{"name": name, **row} for name, row in zip(views.names, rows, strict=True)]}
+
+
+def views_to_recolor(scene: Scene) -> Views:
+    """The test views for `recolor`: where the training views have gains, with gains of 1, as `render` takes gains."""
+    views = scene.test
+    return views if scene.train.gains is None else replace(views, gains=torch.ones(len(views), 3))
 
 
 class Through(NamedTuple):
@@ -142,7 +148,7 @@ def measure_again(
     fresh: dict[str, Any] = {}
     parts = [("test", scene.test), ("train", scene.train)]
     if metrics.get("recolored"):
-        parts.append(("recolored", scene.test))
+        parts.append(("recolored", views_to_recolor(scene)))
     for part, views in parts:
         old = metrics.get(part) or {"views": []}
         try:

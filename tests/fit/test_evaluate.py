@@ -125,6 +125,17 @@ def test_lpips_that_is_not_measured_again_is_kept():
         measure_again(Path("metrics.json"), wrong, scene, render, None)
 
 
+def test_masked_views_without_gains_are_recoloured_for_a_render_that_takes_a_camera_only():
+    views = random_views()
+    masked = replace(views, masks=torch.full_like(views.images[:, :1], 0.5))
+    render = renderer_of(distort(views.images))
+    assert evaluate(render, masked, recolor=True) == evaluate(render, views, recolor=True)
+    none = torch.zeros(0, 3)
+    scene = Scene(masked, masked, none, none, "none", torch.zeros(3), torch.zeros(3), Path("scene"))
+    metrics = {part: evaluate(render, masked, recolor=part == "recolored") for part in ("test", "train", "recolored")}
+    assert measure_again(Path("metrics.json"), metrics, scene, render, None) == metrics
+
+
 def test_float64_renders_are_measured():
     views = random_views(count=1)
     render = distort(views.images)
