@@ -19,6 +19,7 @@ import torch
 from torch import Generator, Tensor, nn
 
 Rate = float | Tensor
+_is_wrapped = getattr(torch._C._functorch, "is_functorch_wrapped_tensor", lambda _: False)  # by vmap, grad, ...
 
 
 def drop_gaussian(
@@ -31,7 +32,7 @@ def drop_gaussian(
 
     Args:
         opacities: floating point, `(N,)` or `(N, 1)` for all cameras, `(C, N)` to drop others in each, or any shape.
-        p: the drop rate, in [0, 1), or a rate for each Gaussian, `(N,)`, or for each opacity; without gradient.
+        p: the drop rate, in [0, 1); a tensor of several has one for each Gaussian, `(N,)`, or opacity. No gradient.
         training: if False, nothing is dropped.
         generator: draws the mask on its own device, whatever that of `opacities`; None uses torch's default one.
         scale: if False, the others keep their values, so that the mean over all masks is 1 - p times the opacity.
@@ -42,10 +43,6 @@ def drop_gaussian(
     Raises:
         TypeError: `opacities` is not a floating point tensor.
         ValueError: p is outside [0, 1), or of another shape; p = 1, which `nn.Dropout` takes, leaves an empty image.
-
-    Examples:
-        >>> drop_gaussian(torch.full((100,), 0.8), p=0.2).unique()
-        tensor([0., 1.])
     """
     rate = _fraction("p", p)
     return _dropped(opacities, rate, generator, scale)[0] if training else opacities
@@ -107,11 +104,13 @@ class DropGaussian(nn.Module):
         factor = self.progress if self.schedule == "linear" else 1.0
         if callable(self.schedule):
             factor = self.schedule(self.progress)
+            if torch.Size(getattr(factor, "shape", ())).numel() != 1:
+                raise ValueError(f"schedule: expected a function to a number, got one to shape {tuple(factor.shape)}")
         return _fraction("p * schedule(progress)", self.p * (0.0 if -1e-6 <= factor < 0.0 else factor))
 
     @property
     def last_scale(self) -> Tensor | None:
-        """Factors of the last opacities in `train()`, 0 where dropped, detached; None before, in `eval()` or a copy."""
+        """Detached factors of the last opacities in `train()`; None before, in `eval()`, a copy, after `torch.func`."""
         return self._last_scale if self.training else None
 
     def forward(self, opacities: Tensor) -> Tensor:
@@ -121,7 +120,8 @@ class DropGaussian(nn.Module):
         return torch.compiler.disable(self._drop)(opacities) if torch.compiler.is_compiling() else self._drop(opacities)
 
     def _drop(self, opacities: Tensor) -> Tensor:
-        dropped, self._last_scale = _dropped(opacities, self.rate, self._generator, self.scale)
+        dropped, factors = _dropped(opacities, self.rate, self._generator, self.scale)
+        self._last_scale = None if _is_wrapped(factors) else factors
         if not self._was_called:
             self._was_called = True
             if self._progress is None and self.schedule != "constant":
@@ -183,7 +183,7 @@ def _dropped(x: Tensor, rate: Rate, generator: Generator | None, scale: bool) ->
 
 
 def _warn(message: str) -> None:
-    """Warn at the line that called the layer: not in this file, torch or kgs."""
+    """Warn at the line that called the layer: not in this file, torch or kgs. (`kgs.errors.warn`, without kgs.)"""
     names = [call.frame.f_globals.get("__name__", "") for call in inspect.stack(context=0)]
     outside = [not f"{name}.".startswith(("torch.", "kgs.", f"{__name__}.")) for name in [*names, ""]]
     warnings.warn(f"DropGaussian: {message}", stacklevel=outside.index(True) + 1)

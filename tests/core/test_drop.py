@@ -4,9 +4,11 @@ import copy
 import importlib
 import math
 import pickle
+import re
 import warnings
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from factories import drop_layer as at
@@ -391,6 +393,44 @@ def test_in_eval_there_are_no_factors_and_those_of_training_stay():
     layer.eval()(x)
     assert layer.last_scale is None
     assert torch.equal(layer.train().last_scale * x, out)
+
+
+@pytest.mark.parametrize("p", [0.5, RATES])
+@pytest.mark.parametrize("seed", [None, 3])
+@pytest.mark.parametrize(
+    "transform",
+    [
+        lambda layer: torch.func.vmap(layer, randomness="different"),
+        lambda layer: torch.func.grad(lambda x: layer(x).sum()),
+        lambda layer: torch.func.functionalize(layer),
+        lambda layer: lambda x: torch.func.jvp(layer, (x,), (x,)),
+    ],
+    ids=["vmap", "grad", "functionalize", "jvp"],
+)
+def test_within_torch_func_there_are_no_factors(transform, seed, p):
+    layer = at(1.0, p=p, seed=seed)
+    x = torch.ones(3, 4)
+    layer(x)
+    transform(layer)(x)
+    factors = layer.last_scale
+    assert factors is None or factors.tolist(), "none, or some that can be read"
+    if seed is None and not isinstance(p, torch.Tensor):
+        assert factors is None
+    out = layer(x)
+    assert torch.equal(out, x * layer.last_scale)
+
+
+@pytest.mark.parametrize("shape", [(4,), (0,), (2, 2)])
+@pytest.mark.parametrize("kind", [torch.ones, np.ones])
+def test_a_schedule_to_several_numbers_is_refused(kind, shape):
+    layer = at(0.5, schedule=lambda progress: kind(shape))
+    with pytest.raises(ValueError, match=rf"schedule: expected a function to a number, .* {re.escape(str(shape))}"):
+        layer(torch.ones(4))
+
+
+@pytest.mark.parametrize("kind", [torch.tensor, np.float32, lambda value: torch.tensor([value])])
+def test_a_schedule_to_one_number_of_any_kind(kind):
+    assert at(0.5, p=0.5, schedule=lambda progress: kind(progress)).rate == 0.25
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda layer: pickle.loads(pickle.dumps(layer))])
