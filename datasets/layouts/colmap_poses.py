@@ -52,10 +52,12 @@ def registered_images(folder: Path) -> Registered:
         (missing,) = (part.name for part in parts if part not in given)
         notes += (f"{given[0].name} is not used: there is no {missing} beside it",)
     elif given and images and (found := _poses_of_frames(images, *parts)) is not None:
-        poses, other_cameras = found
+        poses, other_cameras, gone = found
+        if gone:
+            notes += (f"photos of {parts[0].name} that {source.name} lacks are left out: {gone}",)
         if other_cameras:
             which = f"{other_cameras} of {len(images)} photos have another camera than in {source.name}"
-            notes += (f"{parts[0].name} is not used for lenses: {which}, which COLMAP refuses",)
+            notes += (f"{parts[0].name} is not used for lenses: {which}; COLMAP does not read such a model",)
         if differing := _count_differing(own, poses):
             which = f"the poses of {differing} of {len(images)} photos in {source.name} are not used"
             notes += (f"{which}: {parts[0].name} and {parts[1].name} give others, which COLMAP takes",)
@@ -72,10 +74,11 @@ def _unused_copies(source: Path) -> tuple[str, ...]:
 
 def _poses_of_frames(
     images: Mapping[int, ColmapImage], frames_file: Path, rigs_file: Path
-) -> tuple[Tensor, int] | None:
+) -> tuple[Tensor, int, int] | None:
     """The poses from world to camera by the frames and rigs; how many photos have another camera than in images.*.
 
-    None where both files are empty: COLMAP then takes the poses in images.*.
+    The last number counts photos of the frames that images.* lacks. None where both files are empty: COLMAP then takes
+    the poses in images.*.
     """
     frames = read_frames(frames_file)
     rigs = read_rigs(rigs_file)
@@ -84,12 +87,14 @@ def _poses_of_frames(
     rig_poses: dict[int, tuple[str, ColmapPose]] = {}  # by image: of the rig from the world, of the camera from the rig
     camera_poses: dict[int, tuple[str, ColmapPose]] = {}
     other_cameras = 0
+    gone = 0
     for frame_id, frame in frames.items():
         if frame.rig_id not in rigs:
             raise DataError(frames_file, f"frame {frame_id}", f"has rig {frame.rig_id}, which {rigs_file.name} lacks")
         for image_id, camera_id in frame.cameras.items():
-            if image_id not in images:
-                continue  # one that was taken out of the model
+            if image_id not in images:  # it was taken out of the model
+                gone += 1
+                continue
             name = images[image_id].name
             if image_id in rig_poses:
                 raise DataError(frames_file, name, "expected each image in one frame, got it in two")
@@ -105,7 +110,7 @@ def _poses_of_frames(
         raise DataError(frames_file, lacking[0], f"{reason}: {advice}")
     camera_from_rig = _matrices(rigs_file, [camera_poses[image_id] for image_id in images])
     rig_from_world = _matrices(frames_file, [rig_poses[image_id] for image_id in images])
-    return camera_from_rig @ rig_from_world, other_cameras
+    return camera_from_rig @ rig_from_world, other_cameras, gone
 
 
 def _matrices(source: Path, poses: Sequence[tuple[str, ColmapPose]]) -> Tensor:
