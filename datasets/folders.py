@@ -36,6 +36,7 @@ LAYOUT_FILES = {"LLFF": "poses_bounds.npy", "Blender": "transforms_train.json", 
 _AS_MODEL = "export the cameras of {} as a COLMAP model to use them"
 _CONVERTED = "it is of {}: nerfstudio's ns-process-data {} makes a scene of the export; kgs fit takes {} alone"
 _ALONE = "it has the poses of {}, which are not read: kgs fit takes {} alone"
+_RECORDING = "it is a recording of Record3D: export it as EXR and JPG, for nerfstudio's ns-process-data record3d"
 # Of programs and data sets whose poses are not read: the files that show it, all of them, and what to do.
 _NOT_READ = {
     ("reconstruction.json",): _AS_MODEL.format("OpenSfM"),
@@ -45,10 +46,12 @@ _NOT_READ = {
     ("bundle.out",): _AS_MODEL.format("Bundler"),
     ("*.nvm",): _AS_MODEL.format("VisualSFM"),
     ("keyframes/*cameras/*.json",): _CONVERTED.format("Polycam", "polycam", "keyframes/images"),
+    ("*cameras/*.json", "images"): _CONVERTED.format("Polycam", "polycam", "images"),
     ("metadata.json", "*.exr"): _CONVERTED.format("Record3D", "record3d", "rgb"),
     ("metadata.json", "*/*.exr"): _CONVERTED.format("Record3D", "record3d", "rgb"),
     ("EXR_RGBD/metadata.json",): _CONVERTED.format("Record3D", "record3d", "EXR_RGBD/rgb"),
-    ("*.r3d",): "it is a recording of Record3D: export it as EXR and JPG, for nerfstudio's ns-process-data record3d",
+    ("*.r3d",): _RECORDING,
+    ("rgbd/*.depth",): _RECORDING,  # unpacked
     ("opensfm/reconstruction.json",): _CONVERTED.format("OpenDroneMap", "odm", "images"),
     ("odometry.csv", "camera_matrix.csv"): _ALONE.format("Stray Scanner", "rgb.mp4"),
     ("info.json", "frame_*.json"): _ALONE.format("3D Scanner App", "its photos"),

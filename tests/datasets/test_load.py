@@ -50,6 +50,8 @@ OTHER_PROGRAMS = [
         "Polycam.*ns-process-data polycam.*keyframes/images alone",
     ),
     (["keyframes/corrected_cameras/1.json", "keyframes/cameras/1.json"], "Polycam"),
+    (["cameras/12.json", "images/12.jpg"], "1 photos but no camera poses.*Polycam.*kgs fit takes images alone"),
+    (["corrected_cameras/12.json", "corrected_images/12.jpg", "cameras/12.json", "images/12.jpg"], "Polycam"),
     (
         ["metadata.json", "rgb/0.jpg", "rgb/1.jpg", "depth/0.exr"],
         "metadata.json with .*Record3D.*ns-process-data record3d",
@@ -61,6 +63,7 @@ OTHER_PROGRAMS = [
         "1 photos but no camera poses.*OpenDroneMap.*ns-process-data odm",
     ),
     (["scan.r3d"], "Record3D: export it as EXR and JPG"),
+    *[([name, "rgbd/0.jpg", "rgbd/0.depth"], "Record3D: export it as EXR") for name in ("metadata", "metadata.json")],
     (["odometry.csv", "camera_matrix.csv", "rgb.mp4"], "Stray Scanner.*kgs fit takes rgb.mp4 alone"),
     (
         ["info.json", "frame_00000.json", "frame_00000.jpg"],
