@@ -118,7 +118,8 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
 
     Raises:
         DataError: the file cannot be read, its header is wrong, a property is missing, the number of bytes is not what
-            the header says, or half of the rows or more have a value that is not finite.
+            the header says, half of the rows or more have a value that is not finite, or no row is a Gaussian (a file
+            without rows is an empty model).
         ValueError: `origin` has another shape or is not finite.
     """
     path = Path(path)
@@ -143,7 +144,11 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
         table = np.stack([*means.astype(np.float32).T, *others], axis=1)
     kept = _rows_of_gaussians(path, table, names)
     if not kept.all():
-        warn(f"{path}: {_count_left_out(table, kept)}")
+        reasons = _why_left_out(table, kept)
+        if not kept.any():
+            rows = "1 row that is none" if len(table) == 1 else f"{len(table)} rows that are none"
+            raise DataError(path, "vertex", f"expected at least one Gaussian, got {rows}: {reasons}")
+        warn(f"{path}: {int((~kept).sum())} of {len(table)} Gaussians are left out: {reasons}")
         table = table[kept]
         means = means[kept]
     parts = torch.from_numpy(table).split([3, 3, rest, 1, 3, 4], dim=1)
@@ -201,13 +206,12 @@ def _rows_of_gaussians(path: Path, table: NDArray[np.float32], names: list[str])
     return rows
 
 
-def _count_left_out(table: NDArray[np.float32], kept: NDArray[np.bool_]) -> str:
-    """How many rows are left out, and why."""
+def _why_left_out(table: NDArray[np.float32], kept: NDArray[np.bool_]) -> str:
+    """Why rows are left out, and how many for each reason."""
     without_length = int((~table[:, -4:].any(axis=1)).sum())
     not_finite = int((~kept).sum()) - without_length
-    counts = ((without_length, "have a rotation of length 0"), (not_finite, "have values that are not finite"))
-    reasons = " and ".join(f"{count} {what}" for count, what in counts if count)
-    return f"{int((~kept).sum())} of {len(table)} Gaussians are left out: {reasons}"
+    counts = ((without_length, "a rotation of length 0"), (not_finite, "values that are not finite"))
+    return " and ".join(f"{count} {'has' if count == 1 else 'have'} {what}" for count, what in counts if count)
 
 
 def _degree_of_file(sh_degree: int | None, model: GaussianModel) -> int:

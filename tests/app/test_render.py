@@ -126,6 +126,13 @@ def test_a_splat_that_no_camera_sees_is_refused_before_anything_is_written(splat
         assert not (tmp_path / out).exists()
 
 
+def test_a_splat_without_gaussians_is_refused(splat, llff, tmp_path):
+    save_ply(tmp_path / "empty.ply", kgs.ply.load_ply(splat).select(torch.arange(0)))
+    for command in (render, page):
+        with pytest.raises(DataError, match=r"empty\.ply: Gaussians: expected at least one, got none$"):
+            command(tmp_path / "empty.ply", cameras=llff, out=tmp_path / "out")
+
+
 def test_cameras_that_see_nothing_are_named(splat, llff, tmp_path, capsys):
     render(splat, cameras=llff, out=tmp_path / "all")
     assert "see no Gaussian" not in capsys.readouterr().out

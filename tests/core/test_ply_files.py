@@ -168,6 +168,13 @@ GOOD = handmade(FLOATS, [ROW])
         (handmade([("x", "double"), *FLOATS[1:]], [[1e300, *ROW[1:]]]), "x", "finite float32"),
         (handmade(FLOATS, [ROW], "ascii").replace(b" 2.0", b" nan"), "z", "got nan"),
         (handmade(FLOATS, [ROW], "ascii").replace(b" 10.0", b" 1_0"), "vertex", "nothing but numbers"),
+        (
+            handmade(FLOATS, [[0.0] * 17] * 3),
+            "vertex",
+            "expected at least one Gaussian, got 3 rows that are none: 3 have a rotation of length 0",
+        ),
+        (handmade(FLOATS, [[0.0] * 17], "ascii"), "vertex", "got 1 row that is none: 1 has a rotation of length 0"),
+        (handmade(FLOATS, [[0.0] * 17] * 2 + [[math.nan] + [0.0] * 16]), "vertex", "3 have a rotation of length 0"),
         (handmade(FLOATS, [ROW], "ascii", count=10**17), "vertex", "numbers after the header, got"),
     ],
 )
@@ -194,13 +201,13 @@ def test_opacities_of_one_and_zero_have_infinite_logits(tmp_path, order):
 
 NO_ROTATION = {f"rot_{i}": 0.0 for i in range(4)}
 NO_GAUSSIANS = [
-    ([[0.0] * 17], "1 of 5 Gaussians are left out: 1 have a rotation of length 0"),
+    ([[0.0] * 17], "1 of 5 Gaussians are left out: 1 has a rotation of length 0"),
     ([changed(**NO_ROTATION | {"rot_2": -0.0})] * 9, "9 of 13 Gaussians are left out: 9 have a rotation of length 0"),
-    ([changed(y=math.nan)], "1 of 5 Gaussians are left out: 1 have values that are not finite"),
+    ([changed(y=math.nan)], "1 of 5 Gaussians are left out: 1 has values that are not finite"),
     ([changed(z=-math.inf), changed(scale_1=math.inf)], "2 of 6 Gaussians are left out: 2 have values that are not"),
     ([changed(f_dc_0=math.nan), [math.nan] * 17], "2 of 6 Gaussians are left out: 2 have values that are not finite"),
-    ([changed(rot_0=math.inf), [0.0] * 17], "length 0 and 1 have values that are not finite"),
-    ([changed(**NO_ROTATION, x=math.nan)], "1 of 5 Gaussians are left out: 1 have a rotation of length 0"),
+    ([changed(rot_0=math.inf), [0.0] * 17], "length 0 and 1 has values that are not finite"),
+    ([changed(**NO_ROTATION, x=math.nan)], "1 of 5 Gaussians are left out: 1 has a rotation of length 0"),
 ]
 
 
@@ -216,10 +223,9 @@ def test_rows_that_are_no_gaussians_are_left_out_and_counted(tmp_path, rows, mes
     assert all(bool(parameter.isfinite().all()) for parameter in model.parameters())
 
 
-def test_a_file_of_nothing_but_zeros_is_an_empty_model(tmp_path):
-    (tmp_path / "a.ply").write_bytes(handmade(FLOATS, [[0.0] * 17] * 3))
-    with pytest.warns(UserWarning, match="3 of 3 Gaussians are left out"):
-        assert len(load_ply(tmp_path / "a.ply")) == 0
+def test_a_file_without_rows_is_an_empty_model(tmp_path):
+    (tmp_path / "a.ply").write_bytes(handmade(FLOATS, []))
+    assert len(load_ply(tmp_path / "a.ply")) == 0
 
 
 @pytest.mark.parametrize("order", ["binary_little_endian", "ascii"])

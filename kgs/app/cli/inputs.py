@@ -27,7 +27,7 @@ def load_cameras(cameras: Path, downscale: float | None, photos: bool = False, *
 def load_splat(ply: Path, scene: "Scene", place: "torch.device", backend: str) -> "Fit":
     """A splat in the frame of a scene: its near plane follows from the cameras, antialiasing from the file.
 
-    A DataError if no camera of the scene sees a Gaussian; single cameras that see none are named.
+    A DataError if there is no Gaussian, or no camera of the scene sees one; single cameras that see none are named.
     """
     from kgs.fit.fit import Fit
     from kgs.geometry import typical_depths
@@ -35,6 +35,8 @@ def load_splat(ply: Path, scene: "Scene", place: "torch.device", backend: str) -
     from kgs.types import RasterOptions
 
     model = load_ply(ply, origin=scene.offset)
+    if not len(model):
+        raise DataError(ply, "Gaussians", "expected at least one, got none")
     near_plane = Recipe().near_plane * typical_depths(model.means, scene.train.cameras)[0]
     options = RasterOptions(near_plane=near_plane, antialiased=model.antialiased)
     fit = Fit(scene, model.to(place), options, backend)
