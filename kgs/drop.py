@@ -105,7 +105,7 @@ class DropGaussian(nn.Module):
         if callable(self.schedule):
             factor = self.schedule(self.progress)
             if torch.Size(getattr(factor, "shape", ())).numel() != 1:
-                raise ValueError(f"schedule: expected a function to a number, got one to shape {tuple(factor.shape)}")
+                raise ValueError(f"schedule: expected a function that returns a number, got {factor!r:.80}")
         return _fraction("p * schedule(progress)", self.p * (0.0 if -1e-6 <= factor < 0.0 else factor))
 
     @property

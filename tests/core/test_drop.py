@@ -4,7 +4,6 @@ import copy
 import importlib
 import math
 import pickle
-import re
 import warnings
 from pathlib import Path
 
@@ -422,14 +421,14 @@ def test_within_torch_func_there_are_no_factors(transform, seed, p):
 
 @pytest.mark.parametrize("shape", [(4,), (0,), (2, 2)])
 @pytest.mark.parametrize("kind", [torch.ones, np.ones])
-def test_a_schedule_to_several_numbers_is_refused(kind, shape):
+def test_a_schedule_that_returns_several_numbers_is_refused(kind, shape):
     layer = at(0.5, schedule=lambda progress: kind(shape))
-    with pytest.raises(ValueError, match=rf"schedule: expected a function to a number, .* {re.escape(str(shape))}"):
+    with pytest.raises(ValueError, match=r"schedule: expected a function that returns a number, got (tensor|array)\("):
         layer(torch.ones(4))
 
 
 @pytest.mark.parametrize("kind", [torch.tensor, np.float32, lambda value: torch.tensor([value])])
-def test_a_schedule_to_one_number_of_any_kind(kind):
+def test_a_schedule_may_return_a_number_of_any_kind(kind):
     assert at(0.5, p=0.5, schedule=lambda progress: kind(progress)).rate == 0.25
 
 
