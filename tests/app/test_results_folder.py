@@ -348,7 +348,7 @@ def test_what_the_new_results_lack_goes_but_for_what_is_the_users(scene: Any, do
     assert os.listdir(done / "test") == [second]
     assert seed_of(done) == 1
     fit(replace(scene, test=scene.test.select([])), OTHER, done)
-    assert not (done / "test").exists()
+    assert folders(done) == []
     fit(scene, CONFIG, done)
     for name in ("notes.txt", first):
         (done / "test" / name).write_text("mine")
