@@ -5,6 +5,7 @@ Loads neither NumPy nor torch, so that the command reports a wrong folder at onc
 
 import os
 import re
+import warnings
 from collections.abc import Iterable, Sequence
 from functools import cache
 from importlib.util import find_spec
@@ -97,7 +98,10 @@ def list_pictures(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> l
 
 
 def masks_beside(folder: Path) -> dict[Path, Path]:
-    """The photos in a folder by their masks in it, whose names contain those of the photos, see `photo_of_mask`."""
+    """The photos in a folder by their masks in it: grey pictures whose names contain those of the photos.
+
+    The names are those of `photo_of_mask`; one that does not say that it is a mask ends in `.png`, as COLMAP writes it.
+    """
     pictures = list_pictures(folder, UNREADABLE_SUFFIXES) + list_pictures(folder)
     of_name = {path.name.lower(): path for path in pictures}
     of_stem = {path.stem.lower(): path for path in pictures}
@@ -105,9 +109,34 @@ def masks_beside(folder: Path) -> dict[Path, Path]:
     for path in pictures:
         name, is_marked = photo_of_mask(path)
         photo = of_name.get(name) or (of_stem.get(name) if is_marked else None)
-        if photo is not None and path.suffix.lower() in IMAGE_SUFFIXES:
+        suffixes = IMAGE_SUFFIXES if is_marked else (".png",)
+        if photo is not None and path.suffix.lower() in suffixes and _is_grey(path):
             masks[path] = photo
     return masks
+
+
+def _is_grey(path: Path) -> bool:
+    """Whether a file is a picture without colours, as masks are."""
+    try:
+        status = path.stat()
+        return _is_grey_now(path, status.st_mtime_ns, status.st_size)
+    except OSError:
+        return False
+
+
+@cache
+def _is_grey_now(path: Path, time: int, size: int) -> bool:
+    """`_is_grey` of a file that was changed at this time."""
+    from PIL import Image, ImageChops
+
+    try:
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as image:  # of many pixels, damaged metadata
+            if image.mode in ("1", "L", "LA") or image.mode.startswith("I"):
+                return True
+            red, *others = image.convert("RGB").split()
+        return not any(ImageChops.difference(red, other).getbbox() for other in others)
+    except Exception:  # damaged bytes raise whatever Pillow's plugins happen to raise
+        return False
 
 
 def photo_of_mask(mask: Path) -> tuple[str, bool]:

@@ -6,12 +6,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import PIL.Image
 import pytest
 import torch
 from init_point_scenes import painted_planes
 from tiny_scenes import write_blender, write_colmap, write_llff, write_nerfstudio
 
 from kgs.datasets import load_scene
+from kgs.datasets.folders import list_images
 from kgs.datasets.scene import Views
 from kgs.errors import DataError
 from kgs.fit.config import FitConfig
@@ -128,6 +130,41 @@ def test_masks_among_photos_are_not_counted_as_photos(tmp_path: Path, name: str)
     scene = load_scene(tmp_path, hold_out=0)
     assert len(scene.train) == 3
     assert scene.train.counted is not None
+
+
+@pytest.mark.parametrize(
+    ("photo", "other"),
+    [
+        *(("a.webp", "a.webp.jpg"), ("a.heic", "a.HEIC.jpg"), ("a.jpg", "a.jpg.jpg"), ("a.png", "a.png.jpg")),
+        *(("a.cr2", "a.CR2.png"), ("a.png", "a.png.png"), ("a.jpg", "a_mask.png"), ("a.jpg", "mask_a.jpg")),
+    ],
+)
+@pytest.mark.parametrize("kind", ["colours", "grey", "grey in three channels", "palette", "black and white"])
+def test_a_picture_beside_a_photo_is_a_mask_only_without_colours(
+    tmp_path: Path, photo: str, other: str, kind: str
+) -> None:
+    """Converters and makers of thumbnails add an ending, too: unless its name says mask, a mask ends in .png."""
+    (tmp_path / photo).write_bytes(b"any")
+    picture = PIL.Image.fromarray(LEFT)
+    if kind == "colours":
+        picture = PIL.Image.fromarray(np.dstack([LEFT, LEFT, 0 * LEFT]))
+    elif kind != "grey":
+        mode = {"grey in three channels": "RGB", "palette": "P", "black and white": "1"}[kind]
+        picture = picture.convert(mode if other.endswith(".png") else "RGB")
+    picture.save(tmp_path / other)
+    is_named_so = "mask" in other or other.endswith(".png")
+    readable = {other, photo} - {"a.heic", "a.cr2"}
+    photos = {path.name for path in list_images(tmp_path)}
+    assert photos == (readable - {other} if is_named_so and kind != "colours" else readable)
+
+
+def test_a_photo_of_llff_may_be_called_like_another_one_with_an_ending(tmp_path: Path) -> None:
+    write_llff(tmp_path)
+    photos = sorted((tmp_path / "images").iterdir())
+    photos[1].rename(photos[0].with_name(f"{photos[0].name}.jpg"))
+    scene = load_scene(tmp_path, hold_out=0)
+    assert len(scene.train) == 3
+    assert scene.train.counted is None
 
 
 def test_photos_whose_names_only_look_like_masks_stay_photos(tmp_path: Path) -> None:
