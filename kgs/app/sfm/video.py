@@ -4,8 +4,8 @@ How far the camera moved is told by points that are tracked from frame to frame:
 usual lens would see their median way. Frames between which they hardly moved count as one place, however long the
 camera rested there.
 
-OpenCV turns frames as the header says, and converts their colours to sRGB. What it leaves is done here: pixels that are
-not square become square, and of interlaced frames, whose odd rows are of another moment, the even rows are taken.
+OpenCV turns frames as the header says, and converts their colours to RGB. Pixels that are not square become square
+here.
 
 Source: B. Lucas and T. Kanade, An iterative image registration technique, IJCAI 1981 (OpenCV's pyramidal version).
 """
@@ -38,8 +38,6 @@ _LONGEST = 480  # pixels of a frame that is looked at
 _STEP = 0.75  # degrees; after so large a move new points are tracked
 _TRACKED = 400  # points
 _LOST = 30  # points, of which fewer tell no motion
-_COMBED = 1.4  # measured: at most 1.18 in photos, 1.5 to 3.8 where odd rows are moved by 4 pixels
-_FEWEST_COMBED = 3  # frames of an interlaced video that look so
 _WIDEST_PIXEL = 4.0  # width over height of a pixel, or the inverse, above which a header is damaged
 
 Grey = NDArray[np.uint8]
@@ -70,7 +68,7 @@ def take_frames(
     Raises:
         DataError: the file is not a video that can be read, or the camera moves too little in it.
     """
-    frames, is_interlaced = _look(video, bar)
+    frames = _look(video, bar)
     way = frames[-1].way
     least = _STEP * ((count or FEWEST) - 1)
     if way < least or len(frames) < FEWEST:
@@ -81,9 +79,7 @@ def take_frames(
         count = max(count, min(MOST_FRAMES, math.ceil(way / MOST_DEGREES) + 1))
     indices = _sharpest(frames, count)
     paths = []
-    if is_interlaced:
-        say(f"{video.name} looks interlaced: of each frame every second row is taken")
-    with _Reader(video, is_interlaced) as reader:
+    with _Reader(video) as reader:
         for index in bar(indices, "frames", "frame"):
             pixels = reader.read(index)
             if pixels is None:
@@ -94,38 +90,21 @@ def take_frames(
     return paths
 
 
-def _look(video: Path, bar: ProgressBar, is_interlaced: bool = False) -> tuple[list[_Frame], bool]:
-    """Frames spread over a video, at least one, with their sharpness and way, and whether they are interlaced."""
+def _look(video: Path, bar: ProgressBar) -> list[_Frame]:
+    """Frames spread over a video, at least one, with their sharpness and way."""
     frames = list[_Frame]()
-    combed = 0
-    with _Reader(video, is_interlaced) as reader:
+    with _Reader(video) as reader:
         motion = _Motion()
         every = max(1, reader.count // _LOOKED_AT)
         for index in bar(range(0, reader.count, every), "video", "frame"):
             pixels = reader.read(index)
             if pixels is None:
                 break
-            combed += not is_interlaced and _is_combed(pixels)
-            if combed == _FEWEST_COMBED:
-                break
             grey = _small(pixels)
             frames.append(_Frame(index, sharpness(grey), motion.way_to(grey)))
-    if combed == _FEWEST_COMBED:
-        return _look(video, bar, is_interlaced=True)
     if not frames:
         raise DataError(video, "", "expected a video, got a file without frames that can be decoded")
-    return frames, is_interlaced
-
-
-def _is_combed(pixels: NDArray[np.uint8]) -> bool:
-    """Whether odd rows of a frame are of another moment: neighbouring ones differ more than neighbouring columns do."""
-    green = pixels[..., 1].astype(np.int16)  # in a sample of columns, and of rows
-    return _roughness(green[:, ::8]) > _COMBED * _roughness(green[::8].T)
-
-
-def _roughness(rows: NDArray[np.int16]) -> float:
-    """How much more neighbouring rows differ than the next but one."""
-    return float(np.abs(rows[1:] - rows[:-1]).mean() / (np.abs(rows[2:] - rows[:-2]).mean() + 0.5))
+    return frames
 
 
 def _sharpest(frames: list[_Frame], count: int) -> list[int]:
@@ -181,9 +160,9 @@ class _Motion:
 
 
 class _Reader:
-    """Reads frames of a video in the order of time, with square pixels; of interlaced ones the even rows."""
+    """Reads frames of a video in the order of time, with square pixels."""
 
-    def __init__(self, video: Path, is_interlaced: bool = False) -> None:
+    def __init__(self, video: Path) -> None:
         path = for_opencv(video)
         if path is None:
             raise DataError(video, "", f"expected a video that OpenCV can open: {NOT_UTF8}")
@@ -195,8 +174,7 @@ class _Reader:
             self.count = sum(1 for _ in iter(self._capture.grab, False))
             self._capture.release()
             self._capture = cv2.VideoCapture(str(path))
-        self._rows = 2 if is_interlaced else 1
-        self._pixel_width = self._aspect() / self._rows  # over its height
+        self._pixel_width = self._aspect()  # over its height
 
     def _aspect(self) -> float:
         """Width over height of a pixel of an upright frame; 1 where the header does not say."""
@@ -224,11 +202,11 @@ class _Reader:
         done, pixels = self._capture.retrieve()
         if not done:
             return None
-        height, width = pixels[:: self._rows].shape[:2]
+        height, width = pixels.shape[:2]
         size = round(width * max(self._pixel_width, 1.0)), round(height / min(self._pixel_width, 1.0))
         if size == (width, height):
             return np.asarray(pixels, np.uint8)
-        return np.asarray(cv2.resize(pixels[:: self._rows], size, interpolation=cv2.INTER_CUBIC), np.uint8)
+        return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_CUBIC), np.uint8)
 
 
 def _small(pixels: NDArray[np.uint8]) -> Grey:
