@@ -26,8 +26,9 @@ _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0
 _D65 = (0.3127, 0.3290)
 _BT709 = ((0.64, 0.33), (0.30, 0.60), (0.15, 0.06))
 _SMPTE = ((0.630, 0.340), (0.310, 0.595), (0.155, 0.070))
-# Primaries and white by their number in H.273; 2 is "unspecified".
+# Primaries and white by their number in H.273; 2 is "unspecified", and 0, which is reserved, is taken for it.
 _PRIMARIES = {
+    0: (_BT709, _D65),
     1: (_BT709, _D65),
     2: (_BT709, _D65),
     5: (((0.64, 0.33), (0.29, 0.60), (0.15, 0.06)), _D65),
@@ -38,7 +39,7 @@ _PRIMARIES = {
 }
 # Exponents by the number of the curve, None for sRGB's, for which viewers take the camera curves of BT.601, 709 and
 # 2020, too.
-_GAMMAS = {1: None, 2: None, 4: 2.2, 5: 2.8, 6: None, 8: 1.0, 13: None, 14: None, 15: None}
+_GAMMAS = {0: None, 1: None, 2: None, 4: 2.2, 5: 2.8, 6: None, 8: 1.0, 13: None, 14: None, 15: None}
 _HDR = {16: "PQ", 18: "HLG"}
 
 

@@ -295,7 +295,9 @@ def _profile(kind: str, image: Opened, file: IO[bytes], chunks: dict[bytes, byte
     space = tags.get(_COLOR_SPACE)
     if space == _IS_SRGB:
         return Colors()
-    if space == _IS_ADOBE_RGB or str(tags.get(_INTEROPERABILITY)).startswith("R03"):
+    index = tags.get(_INTEROPERABILITY)
+    index = index.decode("latin-1") if isinstance(index, bytes) else str(index)
+    if space == _IS_ADOBE_RGB or index.startswith("R03"):
         return ADOBE_RGB
     if _WHITE in tags and _PRIMARIES in tags:
         return Colors.of(tags[_WHITE], tags[_PRIMARIES], tags.get(_GAMMA)) or b""

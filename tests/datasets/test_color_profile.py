@@ -164,6 +164,17 @@ def test_adobe_rgb_that_exif_alone_says_becomes_srgb(tmp_path: Path, suffix: str
     np.testing.assert_allclose(photo.pixels, expected, atol=0.7)
 
 
+def test_the_index_may_be_bytes(tmp_path: Path) -> None:
+    """Of the type "undefined" instead of text, as some programs write it."""
+    block = exif(65535, "R03").tobytes()
+    order = "<" if b"II*\0" in block else ">"
+    text, undefined = (struct.pack(f"{order}HHI", 1, kind, 4) for kind in (2, 7))
+    assert block.count(text) == 1
+    path = tmp_path / "a.png"
+    PIL.Image.fromarray(patches()).save(path, exif=block.replace(text, undefined))
+    np.testing.assert_allclose(read_image(path) * 255, to_srgb(patches(), ADOBE_TO_SRGB, 563 / 256), atol=0.1)
+
+
 P3_PLACES = {318: (0.3127, 0.329), 319: (0.68, 0.32, 0.265, 0.69, 0.15, 0.06)}
 
 
@@ -233,6 +244,8 @@ CHUNKS = {
     "cICP of BT.2020": ([(b"cICP", bytes([9, 13, 0, 1]))], BT2020_TO_SRGB, None),
     "cICP of linear light": ([(b"cICP", bytes([1, 8, 0, 1]))], None, 1.0),
     "cICP before a profile": ([(b"cICP", bytes([1, 13, 0, 1])), P3_CHUNK], None, None),
+    "cICP with an unset curve": ([(b"cICP", bytes([12, 0, 0, 1]))], P3_TO_SRGB, None),
+    "cICP with unset primaries": ([(b"cICP", bytes([0, 8, 0, 1]))], None, 1.0),
     "damaged": ([gamma_chunk(0), (b"cHRM", bytes(32))], None, None),
 }
 
