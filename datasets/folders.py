@@ -93,8 +93,9 @@ def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> lis
 
 def list_pictures(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list[Path]:
     """As `list_images`, with masks, but for those of instant-ngp."""
-    files = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith((".", MASK_FILES))]
-    return sorted((path for path in files if not path.is_dir()), key=lambda p: p.name)
+    with os.scandir(folder) as entries:  # which know without a look at the disk whether they are folders
+        files = [entry for entry in entries if entry.name.lower().endswith(suffixes) and not entry.is_dir()]
+    return [folder / name for name in sorted(file.name for file in files) if not name.startswith((".", MASK_FILES))]
 
 
 def masks_beside(folder: Path) -> dict[Path, Path]:

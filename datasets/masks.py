@@ -9,7 +9,7 @@ black there moves, and is not kept.
 Sources: https://docs.nerf.studio/quickstart/data_conventions.html (masks); instant-ngp, docs/nerf_dataset_tips.md.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -70,13 +70,16 @@ def find_masks(photos: Sequence[Path], folder: Path | None) -> dict[Path, Mask]:
     masks = _pictures(folder, photos)
     if not masks:
         raise DataError(folder, "", "expected masks, pictures with the stems of the photos, found none")
-    folders = [place for place in {photo.parent for photo in photos} if place.is_dir()]
+    by_name = _by_name(photos)
+    beside = _by_name(
+        photo for place in {photo.parent for photo in photos} if place.is_dir() for photo in list_images(place)
+    )
     named: dict[Path, Path] = {}
     for mask in masks:
-        fitting = [photo for photo in photos if _fits(mask, photo, folder)]
+        fitting = _fitting(mask, by_name, folder)
         if len(fitting) > 1:
             raise DataError(mask, "", f"expected a mask of one photo, it fits {fitting[0]} and {fitting[1]}")
-        if not fitting and not any(_fits(mask, photo, folder) for place in folders for photo in list_images(place)):
+        if not fitting and not _fitting(mask, beside, folder):
             raise DataError(mask, "", "fits no photo: expected the stem of one, as IMG_1.png for IMG_1.jpg")
         for photo in fitting:
             if photo in named:
@@ -107,11 +110,22 @@ def _beside(photos: Sequence[Path]) -> dict[Path, Mask]:
     return {photo: Mask(ImageFile(mask)) for photo, mask in found.items()}
 
 
-def _fits(mask: Path, photo: Path, folder: Path) -> bool:
+def _by_name(photos: Iterable[Path]) -> dict[str, list[Path]]:
+    """Photos by their names and their stems, in lower case."""
+    found = dict[str, list[Path]]()
+    for photo in photos:
+        for name in {photo.name.lower(), photo.stem.lower()}:
+            found.setdefault(name, []).append(photo)
+    return found
+
+
+def _fitting(mask: Path, photos: dict[str, list[Path]], folder: Path) -> list[Path]:
+    """The photos that a mask in a folder of masks fits by its name and inner folder."""
     inner = mask.parent.relative_to(folder).parts
-    is_there = photo.parent.parts[len(photo.parent.parts) - len(inner) :] == inner
-    names = photo.stem.lower(), photo.name.lower()
-    return is_there and (mask.stem.lower() in names or photo_of_mask(mask)[0] in names)
+    named = dict.fromkeys(
+        photo for name in (mask.stem.lower(), photo_of_mask(mask)[0]) for photo in photos.get(name, ())
+    )
+    return [photo for photo in named if photo.parent.parts[len(photo.parent.parts) - len(inner) :] == inner]
 
 
 def _dynamic(photo: Path) -> Path | None:

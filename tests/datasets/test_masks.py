@@ -1,6 +1,7 @@
 """Masks of photos: found, read, resized with the photo; what they leave out is ignored, or empty."""
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from tiny_scenes import write_blender, write_colmap, write_llff, write_nerfstudi
 
 from kgs.datasets import load_scene
 from kgs.datasets.folders import list_images
+from kgs.datasets.masks import find_masks
 from kgs.datasets.scene import Views
 from kgs.errors import DataError
 from kgs.fit.config import FitConfig
@@ -297,6 +299,25 @@ def test_a_mask_of_a_photo_that_is_not_in_the_model_is_no_error(tmp_path: Path) 
     write_mask(tmp_path / "masks" / "not registered.png")
     write_mask(tmp_path / "masks" / "0.png")
     assert load_scene(tmp_path, hold_out=0).train.counted is not None
+
+
+def test_the_folder_of_photos_is_listed_as_often_for_many_masks_as_for_few(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A model may have registered few of the photos whose masks are there."""
+    seen: list[int] = []
+    for count in (3, 30):
+        root = tmp_path / str(count)
+        for k in range(count):
+            write_mask(root / "images" / f"{k}.png")
+            write_mask(root / "masks" / f"{k}.png")
+        scans: list[object] = []
+        real = os.scandir
+        monkeypatch.setattr(os, "scandir", lambda path, scans=scans, real=real: scans.append(path) or real(path))
+        assert len(find_masks([root / "images" / "0.png"], root / "masks")) == 1
+        monkeypatch.undo()
+        seen.append(len(scans))
+    assert seen[0] == seen[1] > 0
 
 
 @pytest.fixture
