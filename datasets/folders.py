@@ -161,7 +161,7 @@ def mask_folders(places: Iterable[Path]) -> list[Path]:
 
 
 def like_masks(root: Path, photos: Sequence[Path]) -> list[Path]:
-    """Folders beside photos that hold pictures of their names and are called like masks, but not as `mask_folders`."""
+    """Folders beside photos that hold pictures of their names and are named like masks, but not as `mask_folders`."""
     stems = {photo.stem.lower() for photo in photos}
     places = dict.fromkeys([root, *sorted({photo.parent for photo in photos})])
     folders = [path for place in filter(Path.is_dir, places) for path in sorted(place.iterdir()) if path.is_dir()]
@@ -171,7 +171,7 @@ def like_masks(root: Path, photos: Sequence[Path]) -> list[Path]:
 
 
 def is_like_mask(path: Path) -> bool:
-    """Whether a folder or picture that is not taken for masks is called like one."""
+    """Whether a folder or picture that is not taken for masks is named like one."""
     return _LIKE_MASKS.search(path.stem.lower()) is not None
 
 

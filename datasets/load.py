@@ -155,7 +155,7 @@ def _with_masks(root: Path, frame_set: FrameSet, folder: Path | None) -> FrameSe
     beside = [path for place in filter(Path.is_dir, places) for path in list_images(place) if is_like_mask(path)]
     unused = [path.name for path in (*sorted({*beside} - {*photos}), *([] if found else like_masks(root, photos)))]
     if unused:
-        notes += (f"called like masks and not used: {listed(unused, _LISTED)}: {MASKS_ARE_IN}",)
+        notes += (f"named like masks and not used: {listed(unused, _LISTED)}: {MASKS_ARE_IN}",)
     frames, test = ([replace(frame, mask=found.get(frame.path)) for frame in frames] for frames in parts)
     return replace(frame_set, frames=frames, test=None if frame_set.test is None else test, notes=notes)
 

@@ -92,7 +92,7 @@ def notes_on(folder: Path, masks: Path | None = None) -> list[str]:
     """What a folder of photos holds that is not used, a sentence each; `masks` is a folder of masks that is named."""
     notes = [*folders.unused_files(folder), *_nameless(folder), *_inner(folder, masks)]
     if called := [path for path in list_photos(folder) if is_like_mask(path)]:
-        notes.append(f"called like masks and taken for photos: {listed_files(called)}: {MASKS_ARE_IN}")
+        notes.append(f"named like masks and taken for photos: {listed_files(called)}: {MASKS_ARE_IN}")
     if converted := sorted(_converted(folder)):
         notes.append(f"{len(converted)} raw or HEIC files are not used, but their JPEGs: {listed_files(converted)}")
     return notes
@@ -109,13 +109,13 @@ def _nameless(folder: Path) -> list[str]:
 
 
 def _inner(folder: Path, masks: Path | None) -> list[str]:
-    """A sentence about folders in this one that are called like masks, and one about others that may hold photos."""
+    """A sentence about folders in this one that are named like masks, and one about others that may hold photos."""
     used = [path.resolve() for path in (*mask_folders([folder]), *filter(None, [masks]))]
     inner = [path for path in sorted(folder.iterdir()) if path.is_dir() and path.resolve() not in used]
     notes = []
     like = [path for path in like_masks(folder, list_photos(folder)) if path in inner]
     if like and not used and not masks_beside(folder):
-        notes.append(f"called like masks and not used: {listed_files(like)}: {MASKS_ARE_IN}")
+        notes.append(f"named like masks and not used: {listed_files(like)}: {MASKS_ARE_IN}")
         inner = [path for path in inner if path not in like]
     called = {path for path in inner if path.suffix.lower() in (*IMAGE_SUFFIXES, *UNREADABLE_SUFFIXES)}
     if deeper := [path for path in inner if path in called or (_holds_photos(path) and not read_marker(path))]:
