@@ -6,7 +6,7 @@ Loads neither NumPy nor torch, so that the command reports a wrong folder at onc
 import os
 import re
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -158,16 +158,6 @@ def mask_folders(places: Iterable[Path]) -> list[Path]:
         inner = [path for path in sorted(place.iterdir()) if path.name.lower() in MASK_FOLDERS and path.is_dir()]
         found += sorted(inner, key=lambda path: MASK_FOLDERS.index(path.name.lower()))
     return found
-
-
-def like_masks(root: Path, photos: Sequence[Path]) -> list[Path]:
-    """Folders beside photos that hold pictures of their names and are named like masks, but not as `mask_folders`."""
-    stems = {photo.stem.lower() for photo in photos}
-    places = dict.fromkeys([root, *sorted({photo.parent for photo in photos})])
-    folders = [path for place in filter(Path.is_dir, places) for path in sorted(place.iterdir()) if path.is_dir()]
-    known = mask_folders(places)
-    called = [path for path in folders if is_like_mask(path) and path not in known]
-    return [path for path in called if any(photo_of_mask(picture)[0] in stems for picture in list_pictures(path))]
 
 
 def is_like_mask(path: Path) -> bool:

@@ -18,12 +18,13 @@ from torch import Tensor
 from kgs.errors import DataError, listed
 
 from .border import with_border
-from .folders import CAMERAS_REPORT, MASKS_ARE_IN, is_like_mask, like_masks, list_images
+from .folders import CAMERAS_REPORT, MASKS_ARE_IN
 from .frames import LARGEST, Frame, FrameSet
 from .image_file import color_notes
 from .images import rectification, remap, resize
 from .layouts import find_layout
-from .masks import find_masks, mask_folder
+from .mask_files import find_mask_files
+from .masks import as_masks
 from .options import BACKGROUNDS, check_options
 from .scene import Scene, Views, pinholes
 from .splits import TEST_EVERY, select_evenly, split_between_ends, split_by_name
@@ -149,12 +150,11 @@ def _with_masks(root: Path, frame_set: FrameSet, folder: Path | None) -> FrameSe
     if folder is None and any(frame.mask for frames in parts for frame in frames):
         return frame_set
     photos = [frame.path for frames in parts for frame in frames]
-    found = find_masks(photos, mask_folder(root, photos) if folder is None else folder)
+    files = find_mask_files(photos, root, folder)
+    found = as_masks(files)
     notes = frame_set.notes
-    places = sorted({photo.parent for photo in photos})
-    beside = [path for place in filter(Path.is_dir, places) for path in list_images(place) if is_like_mask(path)]
-    unused = [path.name for path in (*sorted({*beside} - {*photos}), *([] if found else like_masks(root, photos)))]
-    if unused:
+    if files.unused:
+        unused = [path.relative_to(root) if path.is_relative_to(root) else path for path in files.unused]
         notes += (f"named like masks and not used: {listed(unused, _LISTED)}: {MASKS_ARE_IN}",)
     frames, test = ([replace(frame, mask=found.get(frame.path)) for frame in frames] for frames in parts)
     return replace(frame_set, frames=frames, test=None if frame_set.test is None else test, notes=notes)

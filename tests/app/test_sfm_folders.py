@@ -21,7 +21,6 @@ from kgs.app.sfm import pose, pose_photos
 from kgs.app.sfm.find import find_photos, notes_on
 from kgs.app.sfm.pycolmap_processes import PycolmapProcesses
 from kgs.app.sfm.read import blurred, open_photos, read_photos, sharpness
-from kgs.datasets.masks import mask_folder
 from kgs.errors import DataError
 from kgs.progress import silent
 
@@ -190,7 +189,7 @@ def test_masks_beside_photos_are_used_and_no_photos(folder, name):
     save(folder / name.rpartition("/")[0], [mask], [name.rpartition("/")[2]])
     paths = find_photos(folder)
     assert [path.name for path in paths] == ["0.png", "1.png", "2.png"]
-    photos = read_photos(open_photos(paths, mask_folder(folder, paths)), silent)
+    photos = read_photos(open_photos(paths), silent)
     np.testing.assert_array_equal(photos[0].mask, mask)
     assert photos[1].mask is None
     assert not notes_on(folder)

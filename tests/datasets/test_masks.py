@@ -15,7 +15,7 @@ from tiny_scenes import write_blender, write_colmap, write_llff, write_nerfstudi
 
 from kgs.datasets import load_scene
 from kgs.datasets.folders import list_images
-from kgs.datasets.masks import find_masks
+from kgs.datasets.mask_files import find_mask_files
 from kgs.datasets.scene import Views
 from kgs.errors import DataError
 from kgs.fit.config import FitConfig
@@ -314,7 +314,7 @@ def test_the_folder_of_photos_is_listed_as_often_for_many_masks_as_for_few(
         scans: list[object] = []
         real = os.scandir
         monkeypatch.setattr(os, "scandir", lambda path, scans=scans, real=real: scans.append(path) or real(path))
-        assert len(find_masks([root / "images" / "0.png"], root / "masks")) == 1
+        assert len(find_mask_files([root / "images" / "0.png"], root).keeping) == 1
         monkeypatch.undo()
         seen.append(len(scans))
     assert seen[0] == seen[1] > 0

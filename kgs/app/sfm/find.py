@@ -13,12 +13,11 @@ from kgs.datasets.folders import (
     VIDEO_SUFFIXES,
     holds_picture,
     is_like_mask,
-    like_masks,
     list_images,
     list_pictures,
     mask_folders,
-    masks_beside,
 )
+from kgs.datasets.mask_files import find_mask_files
 from kgs.errors import DataError, listed
 
 FEWEST = 3
@@ -109,14 +108,16 @@ def _nameless(folder: Path) -> list[str]:
 
 
 def _inner(folder: Path, masks: Path | None) -> list[str]:
-    """A sentence about folders in this one that are named like masks, and one about others that may hold photos."""
+    """A sentence about what is named like masks and not used, and one about other folders that may hold photos."""
+    photos = list_photos(folder)
+    unused = find_mask_files(photos, folder, masks).unused if photos else []
     used = [path.resolve() for path in (*mask_folders([folder]), *filter(None, [masks]))]
     inner = [path for path in sorted(folder.iterdir()) if path.is_dir() and path.resolve() not in used]
+    inner = [path for path in inner if path not in unused]
     notes = []
-    like = [path for path in like_masks(folder, list_photos(folder)) if path in inner]
-    if like and not used and not masks_beside(folder):
-        notes.append(f"named like masks and not used: {listed_files(like)}: {MASKS_ARE_IN}")
-        inner = [path for path in inner if path not in like]
+    if unused:
+        names = [path.relative_to(folder) if path.is_relative_to(folder) else path for path in unused]
+        notes.append(f"named like masks and not used: {listed(names, _LISTED)}: {MASKS_ARE_IN}")
     called = {path for path in inner if path.suffix.lower() in (*IMAGE_SUFFIXES, *UNREADABLE_SUFFIXES)}
     if deeper := [path for path in inner if path in called or (_holds_photos(path) and not read_marker(path))]:
         notes.append(f"not looked into, because they are folders: {listed_files(deeper)}")

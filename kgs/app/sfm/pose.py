@@ -20,7 +20,6 @@ from kgs.app.files.outputs import png_names
 from kgs.app.files.publishing import begin, complete, discard, publish, replacing, unpublished
 from kgs.app.files.results_folder import resumable_fits
 from kgs.datasets.image_file import color_notes
-from kgs.datasets.masks import mask_folder
 from kgs.errors import DataError, printable
 from kgs.json_files import read_json, write_json
 from kgs.machine import versions
@@ -100,7 +99,7 @@ def pose_photos(
         pass
     paths = find_photos(folder)
     check_place(out, folder)
-    opened = open_photos(paths, mask_folder(folder, paths) if masks is None else Path(masks))
+    opened = open_photos(paths, None if masks is None else Path(masks))
     inputs = {
         "settings": SETTINGS,
         "seed": seed,

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from kgs.datasets import folders, image_file
 from kgs.datasets.image_file import Image, ImageFile, turn
 from kgs.datasets.images import Intrinsics, reduce
-from kgs.datasets.masks import Mask, find_masks
+from kgs.datasets.mask_files import find_mask_files
+from kgs.datasets.masks import Mask, as_masks
 from kgs.errors import DataError
 from kgs.progress import ProgressBar
 
@@ -176,12 +177,13 @@ class Photo:
 def open_photos(paths: list[Path], masks: Path | None = None) -> list[OpenPhoto]:
     """Open photos without decoding them. `read_photos` decodes the bytes that are read here, and opens no file again.
 
-    `masks` is a folder with masks of photos.
+    `masks` is a folder with masks of photos; None: those in `masks/` or `mask/` beside the photos. Others are beside
+    their photos.
 
     Raises:
         DataError: a file cannot be read or is not a photo, or a mask is of no photo.
     """
-    found = find_masks(paths, masks)
+    found = as_masks(find_mask_files(paths, paths[0].parent, masks)) if paths else {}
     return [_open(path, found.get(path)) for path in paths]
 
 
