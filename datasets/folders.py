@@ -72,6 +72,7 @@ MASK_FILES = "dynamic_mask_"  # instant-ngp's, beside the photos
 _MASK_NAME = re.compile(r"mask[ _.-](.+)|(.+)[ _.-]mask")
 # Names that only look like those of masks.
 _LIKE_MASKS = re.compile(r"mask|matte|segment|(?<![a-z])(seg|alpha)(?![a-z])")
+_SAME = 8  # levels between the channels of a grey picture that was compressed with loss
 MASKS_ARE_IN = "masks are in masks/ or the folder that --masks names, or beside their photos as IMG_1_mask.png"
 CAMERAS_REPORT = "photos.json"  # beside a scene whose cameras kgs found: how they were found
 _NO_POSES = "kgs fit finds them; or run COLMAP (its model goes to sparse/0), or nerfstudio's ns-process-data"
@@ -135,7 +136,7 @@ def _is_grey_now(path: Path, time: int, size: int) -> bool:
             if image.mode in ("1", "L", "LA") or image.mode.startswith("I"):
                 return True
             red, *others = image.convert("RGB").split()
-        return not any(ImageChops.difference(red, other).getbbox() for other in others)
+        return all(ImageChops.difference(red, other).getextrema()[1] <= _SAME for other in others)
     except Exception:  # damaged bytes raise whatever Pillow's plugins happen to raise
         return False
 
