@@ -27,8 +27,7 @@ def drop_gaussian(
 ) -> Tensor:
     """Set each opacity to 0 with probability p and multiply the others by 1/(1 - p).
 
-    This is `torch.nn.functional.dropout` of activated opacities (never of logits: a logit of 0 is an opacity of 0.5).
-    The result may exceed 1; it must not be clamped, the rasteriser clamps alpha for each pixel.
+    This is `torch.nn.functional.dropout` of activated opacities, never of logits. The result may exceed 1: do not clamp.
 
     Args:
         opacities: floating point, `(N,)` or `(N, 1)` for all cameras, `(C, N)` to drop others in each, or any shape.
@@ -56,11 +55,12 @@ class DropGaussian(nn.Module):
     [0, 1], which are probably logits. The `state_dict` is empty. `torch.compile` runs the layer outside its graphs.
 
     Args:
-        p, scale: as in :func:`drop_gaussian`; p at the end of the schedule. The attribute `p` may be set anew.
+        p: as in :func:`drop_gaussian`, at the end of the schedule. The attribute may be set anew.
         schedule: "linear" (the paper's), "constant", or a function from progress in [0, 1] to a factor.
-        seed: None draws from torch's default generator, as `nn.Dropout` does. An integer gives the layer a stream of
-            its own, which copies continue: another for each rank, and none within `torch.utils.checkpoint`.
+        seed: None draws from torch's default generator, as `nn.Dropout` does. An integer gives the layer its own stream,
+            which copies continue: another for each rank, and none within `torch.utils.checkpoint`.
         device: where that stream draws. On the CPU masks do not depend on the device of the opacities.
+        scale: as in :func:`drop_gaussian`.
 
     Raises:
         ValueError: p or the rate is outside [0, 1), the schedule is unknown, or the seed not from -2^63 to 2^64 - 1.
