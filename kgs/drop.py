@@ -27,7 +27,7 @@ def drop_gaussian(
 ) -> Tensor:
     """Set each opacity to 0 with probability p and multiply the others by 1/(1 - p).
 
-    This is `torch.nn.functional.dropout` of activated opacities, never of logits. The result may exceed 1: do not clamp.
+    This is `torch.nn.functional.dropout` of activated opacities, never logits. It may exceed 1: do not clamp it.
 
     Args:
         opacities: floating point, `(N,)` or `(N, 1)` for all cameras, `(C, N)` to drop others in each, or any shape.
@@ -57,7 +57,7 @@ class DropGaussian(nn.Module):
     Args:
         p: as in :func:`drop_gaussian`, at the end of the schedule. The attribute may be set anew.
         schedule: "linear" (the paper's), "constant", or a function from progress in [0, 1] to a factor.
-        seed: None draws from torch's default generator, as `nn.Dropout` does. An integer gives the layer its own stream,
+        seed: None draws from torch's default generator, as `nn.Dropout` does. An integer gives it a stream of its own,
             which copies continue: another for each rank, and none within `torch.utils.checkpoint`.
         device: where that stream draws. On the CPU masks do not depend on the device of the opacities.
         scale: as in :func:`drop_gaussian`.
