@@ -69,6 +69,7 @@ class Recipe:
         reset_opacity: a reset lowers larger opacities to this; with resets more than `prune_opacity`.
         reset_recovery: a reset is skipped if fewer steps than this follow before the next one or the end.
         alpha_threshold: alphas below it are skipped in training, in [0, 1); in all other renders, those below 1 / 255.
+        threshold_until: share of the steps after which training skips no more than all other renders do, in [0, 1].
         near_plane: distance of the near plane, relative to the 1st percentile of the initial points' depths.
     """
 
@@ -95,6 +96,7 @@ class Recipe:
     reset_opacity: Annotated[float, _Range(0, 1, "()")] = 0.01
     reset_recovery: _Count = 300
     alpha_threshold: Annotated[float, _Range(0, 1, "[)")] = 2 / 255
+    threshold_until: _Share = 2 / 3
     near_plane: _Positive = 0.05
 
     def __post_init__(self) -> None:

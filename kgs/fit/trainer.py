@@ -99,7 +99,6 @@ class Trainer:
         self.renderer = GaussianRenderer(
             state.drop,
             near_plane=state.start.near_plane,
-            alpha_threshold=config.recipe.alpha_threshold,
             max_bytes=config.max_bytes,
             absgrad=config.recipe.absgrad,
             backend=self.plan.backend,
@@ -322,9 +321,13 @@ class Trainer:
         return self._loss
 
     def _set_progress(self, progress: float) -> None:
-        """Set what depends on the share of the steps that are done: learning rate, degree, drop rate."""
+        """Set what depends on the share of the steps that are done: learning rate, degree, drop rate, footprints."""
         state = self.state
         recipe = self.plan.config.recipe
+        threshold = recipe.alpha_threshold
+        if progress > recipe.threshold_until:
+            threshold = min(threshold, RasterOptions.alpha_threshold)
+        self.renderer.options = replace(self.renderer.options, alpha_threshold=threshold)
         rate = decayed(recipe.lr_means, recipe.lr_means_final, progress)
         state.optimizer.param_groups[0]["lr"] = state.start.extent * rate
         degree = sum(state.step >= step for step in self.plan.times.sh)

@@ -12,7 +12,7 @@ from kornia.geometry.camera import PinholeCamera
 from kgs import TrainingDiverged
 from kgs.datasets.scene import Views
 from kgs.densify import Densifier
-from kgs.fit.config import FitConfig, Recipe
+from kgs.fit.config import PAPER, FitConfig, Recipe
 from kgs.fit.plan import make_plan
 from kgs.fit.trainer import Trainer
 from kgs.init_points import InitialPoints
@@ -268,6 +268,23 @@ def test_the_rate_follows_the_papers_schedule(scene, points):
     rates = []
     trainer.fit(lambda trainer, _: rates.append(trainer.state.drop.rate))
     assert rates == pytest.approx([0.3 * step / 12 for step in range(1, 13)])
+
+
+@pytest.mark.parametrize(
+    ("recipe", "early", "late"),
+    [
+        (Recipe(), 2 / 255, 1 / 255),
+        (PAPER.recipe, 1 / 255, 1 / 255),
+        (Recipe(alpha_threshold=0.0), 0.0, 0.0),
+        (Recipe(alpha_threshold=0.1, threshold_until=1.0), 0.1, 0.1),
+    ],
+)
+def test_the_last_steps_skip_no_more_than_all_other_renders(scene, points, recipe, early, late):
+    trainer = begun(scene, points, steps=6, recipe=recipe)
+    thresholds = []
+    trainer.fit(lambda trainer, _: thresholds.append(trainer.renderer.options.alpha_threshold))
+    assert thresholds == [early] * 4 + [late] * 2
+    assert trainer.result().options.alpha_threshold == 1 / 255
 
 
 @pytest.mark.slow
