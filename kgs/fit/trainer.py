@@ -327,7 +327,8 @@ class Trainer:
         threshold = recipe.alpha_threshold
         if progress > recipe.threshold_until:
             threshold = min(threshold, RasterOptions.alpha_threshold)
-        self.renderer.options = replace(self.renderer.options, alpha_threshold=threshold)
+        if threshold != self.renderer.options.alpha_threshold:
+            self.renderer.options = replace(self.renderer.options, alpha_threshold=threshold)
         rate = decayed(recipe.lr_means, recipe.lr_means_final, progress)
         state.optimizer.param_groups[0]["lr"] = state.start.extent * rate
         degree = sum(state.step >= step for step in self.plan.times.sh)

@@ -38,7 +38,7 @@ def check_folder(out: Path, scene: Path | None = None, make: bool = True) -> Non
     if not os.access(there, os.W_OK | os.X_OK):
         raise DataError(out, "", f"results cannot be written there: no permission for {there}")
     inside = scene is not None and out.resolve().is_relative_to(scene.resolve())
-    has_photos = inside and there == out and not all(is_own(out, path.name) for path in list_images(out))
+    has_photos = inside and there == out and not is_own(out, *(path.name for path in list_images(out)))
     of_photos = ("sparse",) if (out / CAMERAS_REPORT).exists() else ()  # kgs wrote it: cameras that a former run found
     if has_photos or any((out / name).exists() for name in _SCENES if name not in of_photos):
         raise DataError(out, "", "holds files of a scene: choose another folder")

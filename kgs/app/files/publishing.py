@@ -130,8 +130,8 @@ def unpublished(out: Path, kind: str) -> list[Path]:
 def discard(work: Path, names: Sequence[str] = (), say: Say = say) -> None:
     """Remove what kgs wrote in a folder of new results, `names` included, and the folder if nothing else is in it."""
     complete(work)
-    entered = [name for files in read_marker(work).values() for name in files]
-    own = [name for name in entered if is_own(work, name)]
+    entered = {name: shas for files in read_marker(work).values() for name, shas in files.items()}
+    own = [name for name, shas in entered.items() if _in_the_way(work, name, shas) is None]
     temporary = [path.name for path in work.iterdir() if _TEMPORARY.fullmatch(path.name)]
     for name in (*own, *names, *temporary, _LOCK, _MARKER_LOCK):
         if not (work / name).is_dir():
@@ -142,25 +142,18 @@ def discard(work: Path, names: Sequence[str] = (), say: Say = say) -> None:
         (work / MARKER).unlink(missing_ok=True)
         say(f"{printable(work)}: what is left there is not of kgs, and stays")
     else:
-        hidden = work.with_name(f".kgs-{uuid.uuid4().hex}")
+        hidden = _hidden_name(work.parent)
         os.rename(work, hidden)  # a kill leaves either of them
         shutil.rmtree(hidden, ignore_errors=True)
 
 
-def clear(out: Path, names: Iterable[str], kind: str, say: Say = say) -> None:
-    """Move what is in the way of new results to `out/kept`: all that a command of the same kind did not write there."""
-    own = read_marker(out).get(kind, {})
-    blocked = [path for name in names if (path := _in_the_way(out, name, own.get(name, ()))) is not None]
-    kept = [_keep(out, path) for path in dict.fromkeys(blocked)]
-    if kept:
-        reason = "because this command did not write it, or it was changed since"
-        say(f"{printable(out)}: moved to {listed(kept, _MOST_NAMED)}, {reason}")
-
-
-def is_own(folder: Path, name: str) -> bool:
-    """Whether a file in a folder of results is as kgs wrote it there."""
-    hashes = [sha for files in read_marker(folder).values() for sha in files.get(name, ())]
-    return os.path.lexists(folder / name) and _in_the_way(folder, name, hashes) is None
+def is_own(folder: Path, *names: str) -> bool:
+    """Whether all of these files in a folder of results are as kgs wrote them there."""
+    kinds = read_marker(folder).values()
+    hashes = {name: [sha for files in kinds for sha in files.get(name, ())] for name in names}
+    return all(
+        os.path.lexists(folder / name) and _in_the_way(folder, name, shas) is None for name, shas in hashes.items()
+    )
 
 
 def read_marker(folder: Path) -> dict[str, Hashes]:
@@ -192,9 +185,13 @@ def _write_marker(folder: Path, entries: dict[str, Hashes]) -> None:
 
 
 def _make_hidden(out: Path) -> Path:
-    work = out / f".kgs-{uuid.uuid4().hex}"
+    work = _hidden_name(out)
     work.mkdir()
     return work
+
+
+def _hidden_name(out: Path) -> Path:
+    return out / f".kgs-{uuid.uuid4().hex}"
 
 
 def _marker_lock(out: Path) -> AbstractContextManager[bool]:
@@ -219,7 +216,11 @@ def _move(work: Path, out: Path, all_former: bool, say: Say) -> None:
     either = {name: [*former.get(name, ()), *new.get(name, ())] for name in {**former, **new}}
     _write_marker(out, {kind: either})  # whichever of the two a kill leaves is known
     waiting = [name for name in new if (work / name).is_file()]
-    clear(out, waiting, kind, say)
+    blocked = [path for name in waiting if (path := _in_the_way(out, name, either[name])) is not None]
+    kept = [_keep(out, path) for path in dict.fromkeys(blocked)]
+    if kept:
+        reason = "because this command did not write it, or it was changed since"
+        say(f"{printable(out)}: moved to {listed(kept, _MOST_NAMED)}, {reason}")
     for name in waiting:
         (out / name).parent.mkdir(parents=True, exist_ok=True)
         os.replace(work / name, out / name)
