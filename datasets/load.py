@@ -18,7 +18,7 @@ from torch import Tensor
 from kgs.errors import DataError, listed
 
 from .border import with_border
-from .folders import CAMERAS_REPORT, MASKS_ARE_IN
+from .folders import CAMERAS_REPORT
 from .frames import LARGEST, Frame, FrameSet
 from .image_file import color_notes
 from .images import rectification, remap, resize
@@ -152,10 +152,7 @@ def _with_masks(root: Path, frame_set: FrameSet, folder: Path | None) -> FrameSe
     photos = [frame.path for frames in parts for frame in frames]
     files = find_mask_files(photos, root, folder)
     found = as_masks(files)
-    notes = frame_set.notes
-    if files.unused:
-        unused = [path.relative_to(root) if path.is_relative_to(root) else path for path in files.unused]
-        notes += (f"named like masks and not used: {listed(unused, _LISTED)}: {MASKS_ARE_IN}",)
+    notes = (*frame_set.notes, *files.notes(root, _LISTED))
     frames, test = ([replace(frame, mask=found.get(frame.path)) for frame in frames] for frames in parts)
     return replace(frame_set, frames=frames, test=None if frame_set.test is None else test, notes=notes)
 

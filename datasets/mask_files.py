@@ -13,11 +13,12 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from kgs.errors import DataError
+from kgs.errors import DataError, listed
 
 from .folders import (
     IMAGE_SUFFIXES,
     MASK_FILES,
+    MASKS_ARE_IN,
     UNREADABLE_SUFFIXES,
     is_like_mask,
     list_images,
@@ -36,6 +37,11 @@ class MaskFiles(NamedTuple):
     keeping: dict[Path, Path]  # white is kept
     moving: dict[Path, Path]  # instant-ngp's: black is kept
     unused: list[Path]  # files that fit no photo or are of one that has a mask, and folders that are named like masks
+
+    def notes(self, root: Path, most: int) -> list[str]:
+        """A sentence that names up to `most` of what is not used, relative to the scene's folder; [] for nothing."""
+        names = [path.relative_to(root) if path.is_relative_to(root) else path for path in self.unused]
+        return [f"named like masks and not used: {listed(names, most)}: {MASKS_ARE_IN}"] if names else []
 
 
 def find_mask_files(photos: Sequence[Path], root: Path, folder: Path | None = None) -> MaskFiles:

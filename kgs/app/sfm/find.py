@@ -110,14 +110,11 @@ def _nameless(folder: Path) -> list[str]:
 def _inner(folder: Path, masks: Path | None) -> list[str]:
     """A sentence about what is named like masks and not used, and one about other folders that may hold photos."""
     photos = list_photos(folder)
-    unused = find_mask_files(photos, folder, masks).unused if photos else []
+    files = find_mask_files(photos, folder, masks) if photos else None
     used = [path.resolve() for path in (*mask_folders([folder]), *filter(None, [masks]))]
     inner = [path for path in sorted(folder.iterdir()) if path.is_dir() and path.resolve() not in used]
-    inner = [path for path in inner if path not in unused]
-    notes = []
-    if unused:
-        names = [path.relative_to(folder) if path.is_relative_to(folder) else path for path in unused]
-        notes.append(f"named like masks and not used: {listed(names, _LISTED)}: {MASKS_ARE_IN}")
+    inner = [path for path in inner if files is None or path not in files.unused]
+    notes = files.notes(folder, _LISTED) if files else []
     called = {path for path in inner if path.suffix.lower() in (*IMAGE_SUFFIXES, *UNREADABLE_SUFFIXES)}
     if deeper := [path for path in inner if path in called or (_holds_photos(path) and not read_marker(path))]:
         notes.append(f"not looked into, because they are folders: {listed_files(deeper)}")
