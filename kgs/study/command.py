@@ -15,7 +15,7 @@ from kgs.errors import DataError
 def study(
     *,
     out: Out,
-    preset: Literal["quick", "cpu", "field", "field-long", "paper", "beyond"] = "quick",
+    preset: Literal["quick", "cpu", "field", "field-long", "paper", "beyond", "guard"] = "quick",
     processes: int | None = None,
     scheduler: str | None = None,
     lpips_weights: Existing | None = None,
@@ -44,7 +44,8 @@ def study(
             field hours on the same and more in full size, field-long on three of them with 10 000 steps; paper is the
             paper's 10 000 steps on every scene there in the size of published tables, for a large machine; beyond
             measures the default from cameras farther out than the photos', on two built-in scenes in minutes, with
-            KGS_DATA on three more.
+            KGS_DATA on three more; guard tells in about 25 minutes on two cores, with KGS_DATA, whether a change of the
+            code has changed the fits of eight scenes: guard.md has them beside stored ones, with the noise of each.
         processes: fits at a time, one per core unless given; the seconds of a fit hold for that many at a time.
         scheduler: address of a Dask scheduler whose workers run the fits instead; they find scenes and weights under
             the same paths.
@@ -55,7 +56,7 @@ def study(
             next four.
         methods: only these methods, as "auto" or "progressive 0.2".
         views: only fits of so many views.
-        seeds: only these seeds.
+        seeds: only these seeds; guard has 0 unless they are given, and with 0 1 2 all that its stored fits need.
         table: only what a table of the paper has, of --preset paper. 1: LLFF with 3, 6 and 9 views; 2: Mip-NeRF 360
             with 12 and 24; 3: Blender with 8; 4: rates and schedules; 5: selected Gaussians dropped; 6: an L1 penalty;
             the last three on LLFF with 3 views.
@@ -70,7 +71,7 @@ def study(
     """
     from kgs.app.files.publishing import replacing
 
-    from . import beyond, beyond_report, paper_tables, presets
+    from . import beyond, beyond_report, guard, paper_tables, presets
     from .cells import sparse_cell
     from .grid import finished_rows, read_rows, run_grid
     from .report import write_report
@@ -85,7 +86,7 @@ def study(
         cells = presets.sparse_cells(preset, data)
         path = out / "sparse.jsonl"
         do_cell = sparse_cell
-        write = partial(write_report, source=path)
+        write = guard.write_guard if preset == "guard" else partial(write_report, source=path)
         if data is not None:
             for setting in presets.too_few_photos(preset, data):
                 print(f"left out: {setting}")
@@ -93,6 +94,8 @@ def study(
     if steps is not None:
         cells = presets.with_steps(cells, steps)
         same += f" --steps {steps}"
+    if preset == "guard" and seeds is None:
+        seeds = (0,)
     chosen = cells if table is None or data is None else paper_tables.cells_of_table(cells, table, data)
     chosen = presets.select(chosen, scenes=scenes, methods=methods, views=views, seeds=seeds)
     if list_cells:
@@ -115,7 +118,9 @@ def study(
             folder = "" if preset == "quick" or data is None else "KGS_DATA=SCENES "
             options = same if lpips_weights is None else f"{same} --lpips-weights WEIGHTS"
             with replacing(out, "study") as new:
-                write(rows, new, f"{folder}kgs study {options} -o OUT", len(cells))
+                text = write(rows, new, f"{folder}kgs study {options} -o OUT", len(cells))
+            if preset == "guard":
+                print(text)
     return int(len(finished_rows(chosen, path)) < len(chosen))
 
 

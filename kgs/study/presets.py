@@ -45,6 +45,9 @@ OBJECTS = {"blender/lego": 8, "nerfstudio/fox": 12, "colmap/monstree": 8}
 SCENES = FORWARD | OBJECTS
 # Scenes that the preset "field" has, too, where they are there, each with as many views as it has photos for.
 JOINED = {"colmap/fortress": (3,), "colmap/kitchen": (12, 24), "colmap/fountain": (3, 6)}
+# The scenes of the preset "guard": photos that face one way, a walk around a statue, objects.
+GUARD = FORWARD | {"colmap/fortress": 3, "colmap/family": 6}
+GUARD |= {"blender/lego": 8, "nerfstudio/fox": 12, "colmap/kitchen": 12}
 MORE_VIEWS = [*product(("llff/fern", "llff/flower"), (6, 9)), ("nerfstudio/fox", 6), ("colmap/monstree", 12)]
 VIEWS = {"llff": (3, 6, 9), "blender": (8,), "colmap": (12, 24), "nerfstudio": (12, 24)}
 _FITS: dict[str, dict[str, Any]] = {
@@ -53,6 +56,7 @@ _FITS: dict[str, dict[str, Any]] = {
     "field": {"steps": 2000},
     "field-long": {"steps": 10_000},
     "paper": {"steps": 10_000},
+    "guard": {"steps": 700},
 }
 Block = tuple[Iterable[int], Iterable[tuple[str, int]], Iterable[str], Iterable[str]]  # seeds, scenes, starts, methods
 
@@ -65,7 +69,8 @@ def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
             504x378, 2000 steps, and the synthetic one to be shown; hours. "field": the six scenes in full size, 2000
             steps, the default with its own number, more views, and what is there of `JOINED`; hours. "field-long": the
             first three of them with 10 000 steps; hours. "paper": 10 000 steps in full size on every scene below
-            `data`; days on a CPU.
+            `data`; days on a CPU. "guard": the eight scenes of `GUARD` in half size, the default with its own number of
+            steps and the paper's rule with 700, seed 0, then the default with seeds 1 and 2; minutes.
         data: the folder of the scenes: `llff/fern` and so on; DataError: None, or a scene is missing.
     """
     if preset not in _FITS:
@@ -81,14 +86,15 @@ def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
     elif data is None:
         raise DataError(Path("KGS_DATA"), "", f"expected this environment variable for the preset {preset!r}, got none")
     else:
-        blocks = {"cpu": _cpu, "field": _field, "field-long": _field_long, "paper": _paper}[preset](data)
+        blocks_of = {"cpu": _cpu, "field": _field, "field-long": _field_long, "paper": _paper, "guard": _guard}
+        blocks = blocks_of[preset](data)
     fits = {method: _FITS[preset] | settings for method, settings in METHODS.items()}
-    if preset == "field":
+    if preset in ("field", "guard"):
         for method in (AUTO, AUTO_OFF):
             fits[method]["steps"] = None  # their own number
     return [
         {"scene": scene, "views": views, "start": start, "method": method, "seed": seed}
-        | {"downscale": 2.0 if preset == "cpu" else None, "fit": fits[method]}
+        | {"downscale": 2.0 if preset in ("cpu", "guard") else None, "fit": fits[method]}
         for block in blocks
         for seed, (scene, views), start, method in product(*block)
     ]
@@ -190,6 +196,14 @@ def _joined(data: Path) -> list[tuple[str, int]]:
 def _field_long(data: Path) -> list[Block]:
     check_scenes(data, FORWARD)
     return [([seed], [scene], ["dense"], (OFF, PAPER, AUTO)) for seed in range(3) for scene in FORWARD.items()]
+
+
+def _guard(data: Path) -> list[Block]:
+    """Three methods with one seed; last the default's other seeds, which tell the noise of each scene."""
+    check_scenes(data, GUARD)
+    blocks: list[Block] = [([0], [scene], ["dense"], (AUTO, AUTO_OFF, PAPER)) for scene in GUARD.items()]
+    blocks.append(((1, 2), GUARD.items(), ["dense"], [AUTO]))
+    return blocks
 
 
 def too_few_photos(preset: str, data: Path) -> list[str]:

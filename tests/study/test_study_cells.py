@@ -20,7 +20,7 @@ from kgs.datasets import load_scene
 from kgs.fit.config import FitConfig
 from kgs.study import cells as cells_module
 from kgs.study.cells import FULL, sparse_cell
-from kgs.study.presets import AUTO, AUTO_OFF, MAIN, METHODS, SCENES, sparse_cells
+from kgs.study.presets import AUTO, AUTO_OFF, GUARD, MAIN, METHODS, SCENES, sparse_cells
 
 
 @pytest.fixture
@@ -28,6 +28,14 @@ def data(tmp_path):
     for scene in SCENES:
         (tmp_path / scene).mkdir(parents=True)
     return tmp_path
+
+
+@pytest.fixture
+def guarded(data):
+    """With the scenes of the preset "guard", too."""
+    for scene in GUARD:
+        (data / scene).mkdir(parents=True, exist_ok=True)
+    return data
 
 
 # -- the cells ----------------------------------------------------------------------------------------------------
@@ -50,9 +58,9 @@ def test_a_package_that_is_missing_is_named_before_any_work(package, tmp_path, m
     assert not list(tmp_path.rglob("*.jsonl"))
 
 
-@pytest.mark.parametrize("preset", ["quick", "cpu", "field", "field-long", "paper"])
-def test_each_cell_is_there_once_and_is_a_fit(preset, data):
-    cells = sparse_cells(preset, data)
+@pytest.mark.parametrize("preset", ["quick", "cpu", "field", "field-long", "paper", "guard"])
+def test_each_cell_is_there_once_and_is_a_fit(preset, guarded):
+    cells = sparse_cells(preset, guarded)
     assert len({json.dumps(cell, sort_keys=True) for cell in cells}) == len(cells)
     for cell in cells:
         fit, _ = cells_module._split({key: value for key, value in cell["fit"].items() if key != "preset"})

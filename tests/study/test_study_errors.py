@@ -47,6 +47,7 @@ CASES = [
     ("KGS_DATA", DataError, lambda _: sparse_cells("cpu", None)),
     ("FOLDER: llff/fern", DataError, lambda folder: sparse_cells("cpu", folder)),
     ("FOLDER", DataError, lambda folder: sparse_cells("paper", folder)),
+    ("FOLDER: llff/fern", DataError, lambda folder: sparse_cells("guard", folder)),
     ("FOLDER: llff/fern", DataError, lambda folder: beyond_cells(folder)),
     ("llff/fern", DataError, lambda _: sparse_cell(tiny_cell() | {"scene": "llff/fern"})),
     ("llff/fern", DataError, lambda _: beyond_cell(tiny_cell() | {"scene": "llff/fern"})),

@@ -1,0 +1,224 @@
+"""The guard: its cells, and what its report says of a run beside stored cells."""
+
+import json
+import math
+from collections import Counter
+
+import numpy as np
+import pytest
+from study_rows import made_up
+
+pytest.importorskip("pandas")
+
+from kgs.study.command import study
+from kgs.study.grid import read_rows
+from kgs.study.guard import STORED, write_guard
+from kgs.study.presets import AUTO, AUTO_OFF, GUARD, PAPER, sparse_cells, with_steps
+
+FERN = "llff/fern, 3 views"
+FLOWER = "llff/flower, 3 views"
+OF_SEEDS = {FERN: (24.0, 24.1, 24.3), FLOWER: (22.0, 22.5, 22.1)}  # stored PSNR of the default
+
+
+@pytest.fixture(scope="module")
+def cells(tmp_path_factory):
+    data = tmp_path_factory.mktemp("data")
+    for scene in GUARD:
+        (data / scene).mkdir(parents=True)
+    return sparse_cells("guard", data)
+
+
+@pytest.fixture
+def rows_of(cells):
+    """Made-up rows of the cells with these scenes, methods and seeds."""
+
+    def rows(scenes=(FERN, FLOWER), methods=(AUTO,), seeds=(0,), change=0.0, lpips=0.1, factor=1.0):
+        found = []
+        for cell in cells:
+            name = f"{cell['scene']}, {cell['views']} views"
+            if name not in scenes or cell["method"] not in methods or cell["seed"] not in seeds:
+                continue
+            row = made_up(cell["scene"], cell["views"], "dense", cell["method"], cell["seed"]) | {"cell": cell}
+            psnr = OF_SEEDS[name][cell["seed"]] + change
+            row["result"]["test"] |= {"psnr": psnr, "lpips_vgg_unscaled": lpips}
+            row["result"] |= {"cpu_seconds": 100.0 * (1 + cell["seed"]) * factor - 17.2, "gaussians": 1000}
+            found.append(row)
+        return found
+
+    return rows
+
+
+@pytest.fixture
+def stored(rows_of, tmp_path):
+    """What is stored: two scenes, the default with three seeds."""
+    write_guard(rows_of(methods=(AUTO, AUTO_OFF, PAPER), seeds=(0, 1, 2)), tmp_path / "stored", "command", 40)
+    return tmp_path / "stored" / "guard.jsonl"
+
+
+def table(text, method=AUTO):
+    """From a line's first cell and a head to the cell."""
+    head, _, *lines = text.split(f"\n{method}:\n\n")[1].split("\n\n")[0].splitlines()
+    heads = [cell.strip() for cell in head.strip("|").split("|")]
+    found = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    return {line[0]: dict(zip(heads, line, strict=True)) for line in found}
+
+
+def noise(scene):
+    return math.sqrt(2) * np.std(OF_SEEDS[scene], ddof=1)
+
+
+# -- the cells ----------------------------------------------------------------------------------------------------
+
+
+def test_one_seed_of_three_methods_comes_first_and_what_tells_the_noise_last(cells):
+    first, last = cells[:24], cells[24:]
+    count = Counter((cell["scene"], cell["views"], cell["method"]) for cell in first)
+    assert count == {(*scene, method): 1 for scene in GUARD.items() for method in (AUTO, AUTO_OFF, PAPER)}
+    assert {cell["seed"] for cell in first} == {0}
+    assert Counter((cell["scene"], cell["seed"]) for cell in last) == {(s, k): 1 for s in GUARD for k in (1, 2)}
+    assert {cell["method"] for cell in last} == {AUTO}
+    assert {(cell["start"], cell["downscale"]) for cell in cells} == {("dense", 2.0)}
+
+
+def test_the_default_has_its_own_steps_and_the_paper_s_rule_few(cells):
+    steps = {(cell["method"], cell["fit"]["steps"]) for cell in cells}
+    assert steps == {(AUTO, None), (AUTO_OFF, None), (PAPER, 700)}
+
+
+@pytest.mark.skipif(not STORED.exists(), reason="no cells are stored yet")
+def test_what_is_stored_are_the_cells_of_the_preset(cells):
+    rows = read_rows(STORED)
+    assert [row["cell"] for row in rows] == cells
+    assert STORED.stat().st_size < 100_000
+
+
+# -- the report ---------------------------------------------------------------------------------------------------
+
+
+def test_changes_are_those_to_the_cell_of_the_same_seed(rows_of, stored, tmp_path):
+    new = rows_of(methods=(AUTO, PAPER), change=0.25, lpips=0.098, factor=1.1)
+    text = write_guard(new, tmp_path / "new", "COMMAND", 40, stored)
+    assert (tmp_path / "new" / "guard.md").read_text(encoding="utf-8") == text.rstrip() + "\n"
+    assert "Command: COMMAND." in text
+    assert "4 of 40 cells, 4 of them with a stored one." in text
+    for method in (AUTO, PAPER):
+        line = table(text, method)[FERN]
+        assert line["PSNR [dB]"] == "24.25"
+        assert line["change of PSNR [dB]"] == f"+0.25 ({noise(FERN):.2f})"
+        assert line["change of LPIPS"] == "-0.0020 (0.0000) !"
+        # the stored default took 100, 200 and 300 s
+        assert line["seconds"] == "110"
+        assert line["change of seconds [%]"] == f"+10.0 ({math.sqrt(2) * 50:.1f})"
+        assert line["change of Gaussians [%]"] == "+0.0 (0.0)"
+
+
+def test_the_mean_has_the_noise_of_its_scenes_and_a_standard_error(rows_of, stored, tmp_path):
+    new = [*rows_of(scenes=(FERN,), change=0.4), *rows_of(scenes=(FLOWER,), change=0.2)]
+    found = table(write_guard(new, tmp_path / "new", "COMMAND", 40, stored))
+    expected = math.sqrt(noise(FERN) ** 2 + noise(FLOWER) ** 2) / 2
+    assert found["mean of 2 scenes"]["change of PSNR [dB]"] == f"+0.30 ({expected:.2f})"
+    assert found["mean of 2 scenes"]["PSNR [dB]"] == "23.30"
+    assert found["standard error"]["change of PSNR [dB]"] == "0.10"  # half the distance of two numbers
+    assert "mean of 1 scenes" not in write_guard(new[:1], tmp_path / "one", "COMMAND", 40, stored)
+
+
+@pytest.mark.parametrize(("noises", "marked"), [(1.9, False), (2.1, True), (-1.9, False), (-2.1, True)])
+def test_what_is_beyond_two_noises_is_marked(noises, marked, rows_of, stored, tmp_path):
+    new = rows_of(scenes=(FERN,), change=noises * noise(FERN))
+    text = write_guard(new, tmp_path / "new", "COMMAND", 40, stored)
+    assert table(text)[FERN]["change of PSNR [dB]"].endswith(" !") == marked
+    assert f"{int(marked)} of 4 changes of single scenes are beyond noise" in text
+
+
+def test_the_report_begins_with_the_means_that_are_beyond_noise(rows_of, stored, tmp_path):
+    text = write_guard(rows_of(change=-1.5), tmp_path / "new", "COMMAND", 40, stored)
+    assert "Beyond noise in the mean: auto: PSNR [dB] -1.50 (" in text
+
+
+def test_unchanged_fits_have_no_change_and_no_mark(rows_of, stored, tmp_path):
+    new = rows_of(methods=(AUTO, AUTO_OFF, PAPER), seeds=(0, 1, 2))
+    text = write_guard(new, tmp_path / "new", "COMMAND", 40, stored)
+    assert "No mean has changed beyond noise." in text
+    assert table(text)[FERN]["change of PSNR [dB]"].startswith("+0.00 (")
+    assert " !" not in text.partition("\nauto:")[2]
+    assert (tmp_path / "new" / "guard.jsonl").read_bytes() == stored.read_bytes()
+
+
+def test_more_seeds_have_less_noise(rows_of, stored, tmp_path):
+    text = write_guard(rows_of(seeds=(0, 1, 2), change=0.1), tmp_path / "new", "COMMAND", 40, stored)
+    assert table(text)[FERN]["change of PSNR [dB]"] == f"+0.10 ({noise(FERN) / math.sqrt(3):.2f})"
+
+
+def test_without_stored_cells_there_are_values_alone(rows_of, tmp_path):
+    text = write_guard(rows_of(), tmp_path / "new", "COMMAND", 40, tmp_path / "none.jsonl")
+    assert list(table(text)[FERN]) == ["scene", "PSNR [dB]", "LPIPS", "seconds", "Gaussians"]
+    assert "There is nothing stored" in text
+    assert "0 of them with a stored one" in text
+
+
+def test_a_stored_cell_that_is_missing_leaves_its_scene_out_of_the_mean_change(rows_of, stored, tmp_path):
+    kept = [line for line in stored.read_text().splitlines() if json.loads(line)["cell"]["scene"] == "llff/fern"]
+    stored.write_text("\n".join(kept) + "\n")
+    found = table(write_guard(rows_of(change=0.3), tmp_path / "new", "COMMAND", 40, stored))
+    assert found[FLOWER]["change of PSNR [dB]"] == "-"
+    assert found[FLOWER]["PSNR [dB]"] == "22.30"
+    assert found["mean of 2 scenes"]["change of PSNR [dB]"] == f"+0.30 ({noise(FERN):.2f})"
+    assert found["standard error"]["change of PSNR [dB]"] == "-"
+
+
+def test_a_stored_default_of_one_seed_tells_changes_without_noise(rows_of, stored, tmp_path):
+    kept = [line for line in stored.read_text().splitlines() if json.loads(line)["cell"]["seed"] == 0]
+    stored.write_text("\n".join(kept) + "\n")
+    text = write_guard(rows_of(change=3.0), tmp_path / "new", "COMMAND", 40, stored)
+    assert table(text)[FERN]["change of PSNR [dB]"] == "+3.00"
+    assert "nothing stored to tell a change from noise by" in text
+
+
+def test_fits_of_other_settings_are_not_compared(rows_of, stored, tmp_path):
+    new = rows_of()
+    for row in new:
+        (row["cell"],) = with_steps([row["cell"]], 30)
+    text = write_guard(new, tmp_path / "new", "COMMAND", 40, stored)
+    assert "change of PSNR [dB]" not in table(text)[FERN]
+
+
+def test_without_weights_lpips_is_left_out(rows_of, stored, tmp_path):
+    line = table(write_guard(rows_of(lpips=None), tmp_path / "new", "COMMAND", 40, stored))[FERN]
+    assert not [head for head in line if "LPIPS" in head]
+    assert "change of PSNR [dB]" in line
+
+
+# -- the command --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def folder(rows_of, cells, tmp_path, monkeypatch):
+    """A run of the preset on one scene, which is done."""
+    rows = rows_of(scenes=(FERN,), methods=(AUTO, AUTO_OFF, PAPER))
+    (tmp_path / "sparse.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    fern = [cell for cell in cells if cell["scene"] == "llff/fern"]
+    monkeypatch.setattr("kgs.study.presets.sparse_cells", lambda *_: fern)
+    monkeypatch.delenv("KGS_DATA", raising=False)
+    return tmp_path
+
+
+def test_seed_0_alone_is_wanted_unless_seeds_are_given(folder, capsys):
+    assert study(out=folder, preset="guard", report_only=True) == 0
+    assert study(out=folder, preset="guard", report_only=True, seeds=(0, 1, 2)) == 1
+    capsys.readouterr()
+    assert study(out=folder, preset="guard", list_cells=True) == 0
+    assert "3 of 3 are done" in capsys.readouterr().out
+    assert study(out=folder, preset="guard", list_cells=True, seeds=(0, 1, 2)) == 0
+    assert "3 of 5 are done" in capsys.readouterr().out
+
+
+def test_the_report_is_printed_and_nothing_is_fitted_again(folder, threads, capsys):
+    cells = (folder / "sparse.jsonl").read_bytes()
+    assert study(out=folder, preset="guard", scheduler=threads) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("3 of 3 cells are there")
+    assert (folder / "guard.md").read_text(encoding="utf-8") in said
+    assert "kgs study --preset guard -o OUT" in said
+    assert (folder / "sparse.jsonl").read_bytes() == cells
+    assert len(read_rows(folder / "guard.jsonl")) == 3
+    assert not (folder / "index.html").exists()
