@@ -37,7 +37,7 @@ _Share = Annotated[float, _Range(0, 1)]
 Backend = Literal["auto", "torch", "numba", "triton"]
 Background = Literal["black", "white"]
 
-DROP = 0.3  # final rate of dropping where few photos show each place
+DROP = 0.3  # final rate of dropping where three photos show each place
 
 
 @dataclass(frozen=True)
@@ -112,13 +112,14 @@ class FitConfig:
 
     `fit_scene` and the command use all entries. A `Trainer` is given its initial points and removes nothing after the
     last step: it ignores init, init_file, init_points, draw and keep_all. Unless :func:`kgs.fit.run.decide` was asked,
-    it takes a `sh_degree` of None as 0, a `drop` of None as 0.3, and all photos as equally exposed.
+    it takes a `sh_degree` of None as 0, a `drop` of None as 0.3, a `steps` of None as 1100 with more than three views,
+    and all photos as equally exposed.
 
     Args:
         steps: number of training steps, to which the recipe's counts are scaled. Unless given: 900 for up to three
-            views, 1100 for more.
-        drop: final rate of DropGaussian, in [0, 1); 0 leaves the layer out. Unless given: 0.3, or 0 if a place is shown
-            by more than 6.5 photos in the mean.
+            views; for more, 275 more for each photo beyond the third that shows a place in the mean, 2000 at most.
+        drop: final rate of DropGaussian, in [0, 1); 0 leaves the layer out. Unless given: 0.3 where a place is shown by
+            three photos in the mean, less where more do, and 0 from 6.5 photos on.
         drop_schedule: linear: the rate grows with the steps, as in the paper. constant: dropout at that rate.
         undropped_steps: number of last steps in which no Gaussian is dropped, at most a tenth of all.
         sh_degree: degree of the view-dependent colour (spherical harmonics), 0 to 3. Unless given: 3

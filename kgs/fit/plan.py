@@ -35,7 +35,7 @@ class Pace(NamedTuple):
 
 
 FEW = Pace(900, 0.9925)  # of a fit to so few training views
-MANY = Pace(1100, 0.995)  # of a fit to more
+MANY = Pace(1100, 0.995)  # of a fit to more, where nothing tells how many of them show each place
 FADING_STEPS = 1000  # up to so many the pace of few views may be used: in longer fits too much would fade
 
 
@@ -45,7 +45,7 @@ class Plan:
 
     Args:
         config: the settings, with numbers for the scene where they were left open. A `sh_degree` of None counts as 0, a
-            `drop` of None as 0.3; :func:`kgs.fit.run.decide` replaces both.
+            `drop` of None as 0.3, a `steps` of None as 1100; :func:`kgs.fit.run.decide` replaces them.
         device: of the fit.
         backend: "numba", "triton" or "torch".
         times: the steps at which things happen.
@@ -65,7 +65,7 @@ class Plan:
 
 
 def make_plan(scene: Scene, config: FitConfig) -> Plan:
-    """Settle what the configuration leaves open, but for the degree of the harmonics and the rate of dropping.
+    """Settle what the configuration leaves open, but for what :func:`kgs.fit.run.decide` decides.
 
     Args:
         scene: the scene to fit.
@@ -85,12 +85,15 @@ def make_plan(scene: Scene, config: FitConfig) -> Plan:
 
 
 def with_pace(config: FitConfig, views: int) -> FitConfig:
-    """The configuration with the numbers for so many training views, where it leaves them open."""
+    """The configuration with the numbers for so many training views, where it leaves them open.
+
+    The number of steps stays open for more than three views: how many of them show each place decides.
+    """
     few = views <= FEW_VIEWS
-    steps = config.steps or (FEW if few else MANY).steps
+    steps = config.steps or (FEW.steps if few else None)
     recipe = config.recipe
     if recipe.opacity_decay is None:
-        pace = FEW if few and steps <= FADING_STEPS else MANY
+        pace = FEW if few and steps is not None and steps <= FADING_STEPS else MANY
         recipe = replace(recipe, opacity_decay=pace.opacity_decay)
     return replace(config, steps=steps, coarse=config.coarse or 0.0, recipe=recipe)
 

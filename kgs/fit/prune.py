@@ -110,9 +110,9 @@ def left_out(needs: dict[str, Any]) -> str:
         if harmonics["by"] == "photos":
             why = f"they can gain {harmonics['gain']:+.2f} dB"
         parts.append(f"harmonics ({why})")
-    dropping = needs.get("drop")
-    if dropping and not dropping["chosen"]:
-        parts.append(f"dropping (a place is shown by {dropping['photos']:.1f} photos)")
+    overlap = needs.get("overlap")
+    if overlap and overlap.get("drop") == 0:
+        parts.append(f"dropping (a place is shown by {overlap['photos']:.1f} photos)")
     if gaussians and gaussians["kept"] < gaussians["fitted"]:
         share = 1 - gaussians["kept"] / gaussians["fitted"]
         parts.append(f"{100 * share:.0f} % of the Gaussians (next to no contribution to a training view)")

@@ -9,9 +9,9 @@ from kgs.init_points.in_view import check_in_view
 from kgs.progress import ProgressBar, silent
 
 from .config import FitConfig
-from .dropping import decide_drop
 from .exposure import decide_exposure
 from .fit import Fit
+from .overlap import decide_by_overlap
 from .plan import Plan, make_plan
 from .prune import prune
 from .trainer import Trainer
@@ -38,8 +38,8 @@ def fit_scene(scene: Scene, config: FitConfig | None = None, *, bar: ProgressBar
 
 
 def decide(plan: Plan, points: InitialPoints) -> Plan:
-    """Decide what the photos tell before a fit: the degree of harmonics, whether to drop, whether exposures differ."""
-    return decide_exposure(decide_drop(decide_degree(plan, points), points), points)
+    """Decide what the photos tell before a fit: its steps, drop rate and harmonics, and whether exposures differ."""
+    return decide_exposure(decide_degree(decide_by_overlap(plan, points), points), points)
 
 
 def choose_points(scene: Scene, config: FitConfig, bar: ProgressBar = silent) -> InitialPoints:

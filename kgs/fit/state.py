@@ -21,7 +21,7 @@ from kgs.model import PARAMETERS, GaussianModel
 
 from .adam import Adam
 from .config import DROP, FitConfig
-from .plan import Plan, most_gaussians
+from .plan import MANY, Plan, most_gaussians
 from .poses import MovingPoses
 
 # for each parameter the name of its learning rate in the recipe, without `lr_`
@@ -235,14 +235,15 @@ def check_saved(saved: dict[str, Any], scene: dict[str, Any], config: FitConfig,
     Returns notes for the user, if a finished fit goes on for more steps.
     """
     check_plain(saved, *PLAIN)
-    planned = saved["config"]["steps"]
+    planned = saved["config"]["steps"] or MANY.steps
     done = saved["step"]
     notes = list[str]()
     asked = config.to_dict() | {"device": saved["config"]["device"]}  # a fit may continue on another device
     if config.backend == "auto":
         asked["backend"] = saved["backend"]
+    if planned == steps or planned == done < steps:
+        asked["steps"] = saved["config"]["steps"]
     if planned == done < steps:
-        asked["steps"] = planned
         notes.append(
             f"trained on from step {done}, the end of a fit of {planned} steps: from here on learning rates, drop "
             f"rate, densification and resets are those of {steps} steps, so that the result differs from a fit of "

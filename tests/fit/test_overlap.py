@@ -1,0 +1,102 @@
+"""Steps and dropping follow how many photos show each place, and are never decided where they are given."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+from kgs.datasets import synthetic_scene
+from kgs.drop import DropGaussian
+from kgs.fit.config import DROP, FitConfig
+from kgs.fit.overlap import FEW_PHOTOS, MANY_PHOTOS, MOST_STEPS, decide_by_overlap, drop_rate_for, steps_for
+from kgs.fit.plan import FEW, MANY, make_plan
+from kgs.fit.prune import left_out
+from kgs.fit.run import fit_scene
+from kgs.fit.trainer import Trainer
+from kgs.init_points import InitialPoints
+from kgs.init_points.patches import MIN_PATCHES, PatchColors
+
+OPEN = FitConfig(evaluations=1)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return synthetic_scene("room", train_views=8, test_views=1, size=(24, 32))
+
+
+def points_seen_by(photos: float, views: int = 8, count: int = 1000):
+    """Points whose patches are shown by so many photos in the mean."""
+    shown = torch.full((count, 1), int(photos))
+    shown[: round((photos - int(photos)) * count)] += 1
+    visible = torch.arange(views) < shown
+    patches = PatchColors(torch.zeros(count, views, 3), visible, torch.zeros(count, views, 3))
+    cloud = torch.rand(50, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor([-0.5, -0.5, 2.0])
+    return InitialPoints(cloud, torch.full((50, 3), 0.5), "dense", patches)
+
+
+def test_steps_rise_and_the_rate_falls_with_the_photos_that_show_a_place():
+    photos = torch.linspace(1.0, 12.0, 111).tolist()
+    steps = [steps_for(n) for n in photos]
+    rates = [drop_rate_for(n) for n in photos]
+    assert steps == sorted(steps)
+    assert rates == sorted(rates, reverse=True)
+    assert (steps_for(FEW_PHOTOS), drop_rate_for(FEW_PHOTOS)) == (FEW.steps, DROP)
+    assert (steps_for(12.0), drop_rate_for(MANY_PHOTOS)) == (MOST_STEPS, 0.0)
+    assert 0 < drop_rate_for(0.5 * (FEW_PHOTOS + MANY_PHOTOS)) < DROP
+
+
+@pytest.mark.parametrize("photos", [3.0, 5.0, 8.0])
+def test_what_is_open_is_decided_by_the_patches(scene, photos):
+    plan = decide_by_overlap(make_plan(scene, OPEN), points_seen_by(photos))
+    chosen = {"steps": steps_for(photos), "drop": drop_rate_for(photos)}
+    assert plan.config == replace(make_plan(scene, OPEN).config, **chosen)
+    assert plan.times.steps == chosen["steps"]
+    found = {"overlap": {"photos": pytest.approx(photos), "n": 1000, **chosen}}
+    assert json.loads(json.dumps(plan.needs)) == found
+    assert ("dropping" in left_out(plan.needs)) == (chosen["drop"] == 0)
+    assert (Trainer(scene, plan, points_seen_by(photos)).state.drop is None) == (chosen["drop"] == 0)
+
+
+@pytest.mark.parametrize(
+    "points", [points_seen_by(8.0, count=MIN_PATCHES - 1), replace(points_seen_by(8.0), patches=None)]
+)
+def test_without_patches_gaussians_are_dropped_in_a_fit_of_the_usual_length(scene, points):
+    plan = decide_by_overlap(make_plan(scene, OPEN), points)
+    assert (plan.config.drop, plan.config.steps, plan.needs) == (DROP, MANY.steps, {})
+
+
+@pytest.mark.parametrize("given", [{"drop": 0.0}, {"drop": 0.2}, {"steps": 7}, {"steps": 7, "drop": 0.2}])
+def test_what_is_given_is_not_decided(scene, given):
+    plan = decide_by_overlap(make_plan(scene, replace(OPEN, **given)), points_seen_by(8.0))
+    assert {name: getattr(plan.config, name) for name in given} == given
+    assert not given.keys() & plan.needs.get("overlap", {}).keys()
+
+
+def test_a_trainer_whose_plan_is_open_drops_in_a_fit_of_the_usual_length(scene, tmp_path):
+    trainer = Trainer(scene, make_plan(scene, OPEN), points_seen_by(3.0))
+    assert isinstance(trainer.state.drop, DropGaussian)
+    assert (trainer.state.drop.p, trainer.plan.times.steps) == (DROP, MANY.steps)
+    trainer.save(tmp_path / "c.safetensors")
+    assert Trainer.resume(scene, OPEN, tmp_path / "c.safetensors").plan.times.steps == MANY.steps
+
+
+def test_a_fit_goes_on_as_it_was_decided(scene, tmp_path):
+    plan = decide_by_overlap(make_plan(scene, OPEN), points_seen_by(8.0))
+    trainer = Trainer(scene, plan, points_seen_by(8.0))
+    trainer.train_step()
+    trainer.save(tmp_path / "c.safetensors")
+    resumed = Trainer.resume(scene, OPEN, tmp_path / "c.safetensors")
+    assert resumed.state.drop is None
+    assert resumed.plan.needs == plan.needs
+    assert (resumed.plan.config.drop, resumed.plan.times.steps) == (0, steps_for(8.0))
+
+
+def test_a_whole_fit_says_what_it_decided():
+    """Eight photos of the room, all of which show most places."""
+    large = synthetic_scene("room", train_views=8, test_views=1, size=(96, 128))
+    fit = fit_scene(large, FitConfig(steps=4, evaluations=1))
+    found = fit.history["needs"]["overlap"]
+    assert 3 <= found["photos"] <= 8
+    assert found["drop"] == fit.settings.drop == pytest.approx(drop_rate_for(found["photos"]), abs=0.01)
+    assert "steps" not in found
