@@ -10,6 +10,8 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from torch import Tensor
+
 from kgs.app.console import each, progress, say
 from kgs.app.files.cameras import as_taken
 from kgs.app.files.figures import write_curve
@@ -271,10 +273,14 @@ def _write_results(fit: Fit, folder: Path, names: dict[str, str], request: Scene
     write_curve(folder / "curve.png", {"": fit.history["curve"]})
     notes = write_exports(fit, folder, request.roll)
     (folder / "test").mkdir(exist_ok=True)
-    for i, name in each(list(enumerate(scene.test.names)), "test pictures", "view"):
-        render = scene.test.render(i, fit.render)[0]
-        write_png(folder / "test" / names[name], as_taken(scene.test.as_photo(i, render), scene.test, i))
-    metrics = measure(fit, lpips)
+    with progress(len(scene.test), "test pictures", unit="view") as advance:
+
+        def write_picture(i: int, image: Tensor) -> None:
+            picture = as_taken(scene.test.as_photo(i, image[0]), scene.test, i)
+            write_png(folder / "test" / names[scene.test.names[i]], picture)
+            advance()
+
+        metrics = measure(fit, lpips, write_picture)
     write_json(folder / "metrics.json", metrics)
     return replace(fit, metrics=metrics, notes=(*fit.notes, *notes))
 

@@ -1,9 +1,12 @@
 """Measures a fit: the content of metrics.json."""
 
+from collections.abc import Callable
 from typing import Any
 
+from torch import Tensor
+
 from kgs.machine import peak_rss_mb, versions
-from kgs.metrics.coverage import measure_coverage
+from kgs.metrics.coverage import Coverage
 from kgs.metrics.evaluate import evaluate, views_to_recolor
 from kgs.metrics.lpips import Lpips
 
@@ -33,12 +36,13 @@ def used_init(asked: str, kind: str) -> str:
     return asked if (asked, kind) == ("scene", "random") else kind
 
 
-def measure(fit: Fit, lpips: Lpips | None = None) -> dict[str, Any]:
+def measure(fit: Fit, lpips: Lpips | None = None, look: Callable[[int, Tensor], None] | None = None) -> dict[str, Any]:
     """Measure a fit on its test and training views.
 
     Args:
         fit: of kgs; a splat alone has no settings.
         lpips: the perceptual metric, on the device of the fit, or None to leave it out.
+        look: called with the number of each test view and its render, see :func:`kgs.metrics.evaluate.evaluate`.
 
     Returns:
         The content of metrics.json as plain values; None stands for what was not measured. Where the training photos
@@ -62,14 +66,21 @@ def measure(fit: Fit, lpips: Lpips | None = None) -> dict[str, Any]:
         poses += ", those of the training views refined by the fit"
     everywhere = all(views.counted is None for views in (scene.train, scene.test))
     pixels = "all pixels" if everywhere else "the pixels that count; SSIM and LPIPS take the others as equal"
+    coverage = Coverage(scene, fit.median_depth)
+
+    def look_at(view: int, image: Tensor) -> None:
+        coverage.add(view, image)
+        if look is not None:
+            look(view, image)
+
     recolored = {}
     if scene.train.gains is not None and len(scene.test):
         recolored["recolored"] = evaluate(fit.render, views_to_recolor(scene), lpips, recolor=True)
     return {
-        "test": evaluate(fit.render, scene.test, lpips) if len(scene.test) else None,
+        "test": evaluate(fit.render, scene.test, lpips, look=look_at) if len(scene.test) else None,
         **recolored,
         "train": evaluate(fit.render, scene.train, lpips),
-        "seen": measure_coverage(scene, fit.render, fit.median_depth),
+        "seen": coverage.means(),
         **fit.history,
         "peak_rss_mb": peak_rss_mb() or None,
         "gaussians": len(fit.model),

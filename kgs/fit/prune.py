@@ -1,6 +1,8 @@
 """Removes what the training views do not need: Gaussians that contribute next to nothing, and unused harmonics."""
 
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import torch
@@ -38,7 +40,7 @@ def prune(fit: Fit) -> Fit:
     for limit in WEIGHTS:
         rows = weights > limit
         pruned = _part(fit, rows, model.sh_degree)
-        if _is_close(training_levels(pruned), levels):
+        if _is_as_good(pruned, levels):
             break
     pruned = _with_fewest_harmonics(fit, pruned, levels)
     record = {
@@ -59,30 +61,30 @@ def _part(fit: Fit, rows: Tensor, sh_degree: int) -> Fit:
 
 def _with_fewest_harmonics(fit: Fit, pruned: Fit, levels: list[float]) -> Fit:
     """The pruned fit with the lowest degree that changes no image."""
-    most = fit.model.sh_degree
-    if not most:
-        return pruned
     views = fit.scene.train
-    cameras = [views.camera(i) for i in range(len(views))]
-    images = [pruned.render(camera) for camera in cameras]
     rows = pruned.part["rows"].to(fit.device)
-    for degree in range(most + 1):
+    image_of = cache(lambda i: pruned.render(views.camera(i)))
+    for degree in range(fit.model.sh_degree):
         lower = _part(fit, rows, degree)
-        renders = map(lower.render, cameras)
-        same = all(bool(((now - before).abs() <= QUANTUM).all()) for now, before in zip(renders, images, strict=True))
-        if same and _is_close(training_levels(lower), levels):
-            break
-    return lower
+        changes = ((lower.render(views.camera(i)) - image_of(i)).abs() for i in range(len(views)))
+        if all(bool((change <= QUANTUM).all()) for change in changes) and _is_as_good(lower, levels):
+            return lower
+    return pruned
 
 
-def _is_close(levels: list[float], others: list[float]) -> bool:
-    return all(abs(level - other) <= TOLERANCE for level, other in zip(levels, others, strict=True))
+def _is_as_good(fit: Fit, levels: list[float]) -> bool:
+    """Whether no training view has another PSNR; none is rendered after one that has."""
+    return all(abs(level - before) <= TOLERANCE for level, before in zip(_levels(fit), levels, strict=True))
 
 
 def training_levels(fit: Fit) -> list[float]:
     """The PSNR of each training view in dB; `kgs.metrics.evaluate.BEST` stands for infinity."""
+    return list(_levels(fit))
+
+
+def _levels(fit: Fit) -> Iterator[float]:
     views = fit.scene.train
-    return [comparable(fit.psnr(views.select([i]))) for i in range(len(views))]
+    return (comparable(fit.psnr(views.select([i]))) for i in range(len(views)))
 
 
 def contributions(model: GaussianModel, views: Views, options: RasterOptions, backend: str = "auto") -> Tensor:

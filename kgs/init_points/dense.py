@@ -5,6 +5,7 @@ which fog the view of cameras beside the photos'. Points of the sky are a minori
 stays that of the scene.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -122,16 +123,25 @@ def _with_less_sky(is_sky: Tensor) -> Tensor:
 def _one_per_cell(places: NDArray[np.int64], count: int) -> Tensor:
     """The rows of the first place `(view, x, y)` in each of at most `count` square cells, as small as that allows."""
     first = np.arange(len(places))
-    across = places.max(initial=0) + 1
-    least, most = 1.0, float(across)  # limits of a cell's side in pixels, for bisection
+    views, width, height = places.max(0, initial=0).tolist()
+    view, x, y = places.T
+    least, most = 1.0, max(width, height) + 1.0  # limits of a cell's side in pixels, for bisection
     while len(first) > count or (len(places) > count and most - least > 1e-3):
         side = 0.5 * (least + most)
-        columns, rows = (places[:, 1:] / side).astype(np.int64).T
-        _, first = np.unique((places[:, 0] * across + columns) * across + rows, return_index=True)
+        shape = (views + 1, int(width / side) + 1, int(height / side) + 1)
+        cells = np.ravel_multi_index((view, (x / side).astype(np.int64), (y / side).astype(np.int64)), shape)
+        first = _first_of_each(cells, math.prod(shape))
         least, most = (side, most) if len(first) > count else (least, side)
         if most - least < 1e-9:
             break  # more views than points
     return torch.from_numpy(np.sort(first))[:count]
+
+
+def _first_of_each(numbers: NDArray[np.int64], end: int) -> NDArray[np.int64]:
+    """Where each of the numbers below `end` comes first, as `np.unique` finds it, without sorting them."""
+    first = np.full(end, -1)
+    first[numbers[::-1]] = np.arange(len(numbers))[::-1]  # of equal numbers the last one that is assigned stays
+    return first[first >= 0]
 
 
 def _agreed(

@@ -5,8 +5,8 @@ A single training view does not determine depth, and what no view shows is guess
 
 import math
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from statistics import fmean
-from typing import Any
 
 import torch
 from kornia.geometry.camera import PinholeCamera
@@ -15,14 +15,11 @@ from torch import Tensor
 from kgs.datasets.scene import Scene
 from kgs.geometry import nearest_pixels, project_points, unproject
 
-RenderView = Callable[..., Tensor]  # of a camera
-
 MIN_VIEWS = 2  # training views that show a point
 OCCLUDED = 1.05  # a point is hidden from a view if it is farther than this times the view's depth there
 
 
-@torch.no_grad()
-def measure_coverage(scene: Scene, render: RenderView, median_depth: RenderView) -> dict[str, float | None] | None:
+class Coverage:
     """PSNR of the test views, separately for pixels that at least `MIN_VIEWS` training views show and for the rest.
 
     Convention:
@@ -32,33 +29,48 @@ def measure_coverage(scene: Scene, render: RenderView, median_depth: RenderView)
 
     Args:
         scene: training and test views.
-        render: from a camera to its image `(1, 3, H, W)`.
         median_depth: from a camera to its median depth `(H, W)` on the CPU, 0 where there is nothing.
-
-    Returns:
-        "share" of the test pixels that are shown, in [0, 1], "psnr" of them and "psnr_rest" in dB, means over the
-        views that have such pixels; None if no view has, or if the error is 0. None without test views.
     """
-    train = scene.train
-    test = scene.test
-    if not len(test):
-        return None
-    depths = [median_depth(train.camera(view)) for view in range(len(train))]
-    levels: dict[str, list[float]] = {"psnr": [], "psnr_rest": []}
-    shares = []
-    for view in range(len(test)):
+
+    def __init__(self, scene: Scene, median_depth: Callable[[PinholeCamera], Tensor]) -> None:
+        self._scene = scene
+        self._median_depth = median_depth
+        self._levels: dict[str, list[float]] = {"psnr": [], "psnr_rest": []}
+        self._shares = list[float]()
+
+    @cached_property
+    def _depths(self) -> list[Tensor]:
+        """Of the training views."""
+        train = self._scene.train
+        return [self._median_depth(train.camera(view)) for view in range(len(train))]
+
+    @torch.no_grad()
+    def add(self, view: int, image: Tensor) -> None:
+        """Take in a test view: its number and its render `(1, 3, H, W)`, as :meth:`Views.render` returns it."""
+        test = self._scene.test
         camera = test.camera(view)
-        covered = views_that_show(median_depth(camera), camera, depths, train.cameras) >= MIN_VIEWS
-        image, photo, _ = test.compared(view, test.render(view, render)[0].cpu())
+        depth = self._median_depth(camera)
+        covered = views_that_show(depth, camera, self._depths, self._scene.train.cameras) >= MIN_VIEWS
+        image, photo, _ = test.compared(view, image[0].cpu())
         errors = (image - photo).square().mean(dim=0)
         counted = torch.ones_like(covered) if test.counted is None else test.counted[view].cpu()
-        shares.append(float(covered[counted].float().mean()) if counted.any() else 0.0)
+        self._shares.append(float(covered[counted].float().mean()) if counted.any() else 0.0)
         for name, where in (("psnr", covered & counted), ("psnr_rest", ~covered & counted)):
             error = float(errors[where].mean()) if where.any() else 0.0
             if error > 0:
-                levels[name].append(-10 * math.log10(error))
-    means: dict[str, Any] = {name: round(fmean(values), 4) if values else None for name, values in levels.items()}
-    return {"share": round(fmean(shares), 4), **means}
+                self._levels[name].append(-10 * math.log10(error))
+
+    def means(self) -> dict[str, float | None] | None:
+        """The means over the views that were added; None if none was.
+
+        Returns:
+            "share" of the pixels that are shown, in [0, 1], "psnr" of them and "psnr_rest" in dB, means over the views
+            that have such pixels; None if no view has, or if the error is 0.
+        """
+        if not self._shares:
+            return None
+        levels = {name: round(fmean(values), 4) if values else None for name, values in self._levels.items()}
+        return {"share": round(fmean(self._shares), 4), **levels}
 
 
 def views_that_show(depth: Tensor, camera: PinholeCamera, depths: Sequence[Tensor], cameras: PinholeCamera) -> Tensor:

@@ -32,7 +32,12 @@ _WINDOW = 11
 
 @torch.no_grad()
 def evaluate(
-    render: Callable[..., Tensor], views: Views, lpips: Lpips | None = None, *, recolor: bool = False
+    render: Callable[..., Tensor],
+    views: Views,
+    lpips: Lpips | None = None,
+    *,
+    recolor: bool = False,
+    look: Callable[[int, Tensor], None] | None = None,
 ) -> dict[str, Any]:
     """Render each view from its camera, to `(1, 3, H, W)`, and compare it with its photo; no gradients are kept.
 
@@ -41,6 +46,8 @@ def evaluate(
     With `recolor`, each channel of a render first gets the gain and the offset that fit it best to the photo: what
     exposure and white balance of a held-out photo do is then not counted. Where views have gains, and masks let a
     background show through, only the colours of the scene get them.
+
+    `look` is called with the number of each view and its render, as :meth:`kgs.datasets.scene.Views.render` returns it.
 
     Views have at least 6 x 6 pixels, 16 x 16 with `lpips`, a network on the device of the renders. A ValueError for a
     render that differs in shape from its photo or holds NaN or infinity.
@@ -61,6 +68,8 @@ def evaluate(
             raise ValueError(f"render: expected shape {tuple(target.shape)} for {name}, got {tuple(image.shape)}")
         if not bool(image.isfinite().all()):
             raise ValueError(f"render: expected finite values for {name}, got NaN or infinity")
+        if look is not None:
+            look(index, image)
         shown, photo, share = views.compared(index, image)
         if recolor:
             counted = None if views.counted is None else views.counted[index]

@@ -46,3 +46,14 @@ def test_points_of_somebody_else_are_not_taken_for_those_of_the_photos(tiny):
 def test_random_points_of_a_layout_are_those_of_the_scene():
     assert used_init("scene", "random") == "scene"
     assert used_init("dense", "model-points") == "model-points"
+
+
+def test_a_test_view_is_rendered_once_and_shown_to_who_looks(tiny, monkeypatch):
+    fit = fit_scene(tiny, replace(CONFIG, init="random"))
+    plain = fit.render(tiny.test.camera(0))
+    renders = []
+    monkeypatch.setattr(type(fit), "render", lambda _, camera: renders.append(camera) or plain)
+    looks = []
+    measure(fit, look=lambda view, image: looks.append((view, image)))
+    assert looks == [(0, plain)]
+    assert len(renders) == len(tiny.test) + len(tiny.train)

@@ -115,10 +115,14 @@ def lenses(cameras: PinholeCamera) -> list[tuple[Array, Array, NDArray[np.intp]]
 
 def visible_points(points: Array, k: Array, pose: Array, size: NDArray[np.intp], near_plane: float = 0.0) -> Array:
     """Those of the points `(N, 3)` that lie inside the image and beyond the near plane, in the camera's axes."""
-    in_camera = points @ pose[:3, :3].T + pose[:3, 3]
+    turn = np.ascontiguousarray(pose[:3, :3].T)  # NumPy multiplies by a part of a matrix without BLAS: 100 times slower
+    in_camera = points @ turn + pose[:3, 3]
     in_front = in_camera[in_camera[:, 2] > near_plane]
-    pixels = in_front[:, :2] / in_front[:, 2:] * k.diagonal()[:2] + k[:2, 2]
-    inside: Array = in_front[((pixels >= -0.5) & (pixels <= size - 0.5)).all(axis=1)]
+    x, y, z = in_front.T
+    columns = x / z * k[0, 0] + k[0, 2]
+    rows = y / z * k[1, 1] + k[1, 2]
+    width, height = size - 0.5
+    inside: Array = in_front[(columns >= -0.5) & (columns <= width) & (rows >= -0.5) & (rows <= height)]
     return inside
 
 
