@@ -37,7 +37,7 @@ _Share = Annotated[float, _Range(0, 1)]
 Backend = Literal["auto", "torch", "numba", "triton"]
 Background = Literal["black", "white"]
 
-DROP = 0.3  # final rate of dropping where three photos show each place
+DROP = 0.3  # final rate of dropping where few photos show the same places
 
 
 @dataclass(frozen=True)
@@ -117,9 +117,9 @@ class FitConfig:
 
     Args:
         steps: number of training steps, to which the recipe's counts are scaled. Unless given: 900 for up to three
-            views; for more, 275 more for each photo beyond the third that shows a place in the mean, 2000 at most.
-        drop: final rate of DropGaussian, in [0, 1); 0 leaves the layer out. Unless given: 0.3 where a place is shown by
-            three photos in the mean, less where more do, and 0 from 6.5 photos on.
+            views; for more, 275 more for each photo beyond the third that shows a place in the mean, 1800 at most.
+        drop: final rate of DropGaussian, in [0, 1); 0 leaves the layer out. Unless given: 0.3 where three photos or
+            fewer show two places at once in the mean, less where more do, and 0 from five on.
         drop_schedule: linear: the rate grows with the steps, as in the paper. constant: dropout at that rate.
         undropped_steps: number of last steps in which no Gaussian is dropped, at most a tenth of all.
         sh_degree: degree of the view-dependent colour (spherical harmonics), 0 to 3. Unless given: 3

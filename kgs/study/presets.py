@@ -44,7 +44,7 @@ FORWARD = {"llff/fern": 3, "llff/flower": 3, "colmap/trex": 3}
 OBJECTS = {"blender/lego": 8, "nerfstudio/fox": 12, "colmap/monstree": 8}
 SCENES = FORWARD | OBJECTS
 # Scenes that the preset "field" has, too, where they are there, each with as many views as it has photos for.
-JOINED = {"colmap/fortress": (3,), "colmap/kitchen": (12, 24), "colmap/fountain": (3, 6)}
+JOINED = {"colmap/family": (6,), "colmap/fortress": (3,), "colmap/kitchen": (12, 24), "colmap/fountain": (3, 6)}
 # The scenes of the preset "guard": photos that face one way, a walk around a statue, objects.
 GUARD = FORWARD | {"colmap/fortress": 3, "colmap/family": 6}
 GUARD |= {"blender/lego": 8, "nerfstudio/fox": 12, "colmap/kitchen": 12}

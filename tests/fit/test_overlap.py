@@ -9,7 +9,15 @@ import torch
 from kgs.datasets import synthetic_scene
 from kgs.drop import DropGaussian
 from kgs.fit.config import DROP, FitConfig
-from kgs.fit.overlap import FEW_PHOTOS, MANY_PHOTOS, MOST_STEPS, decide_by_overlap, drop_rate_for, steps_for
+from kgs.fit.overlap import (
+    FEW_TOGETHER,
+    MANY_TOGETHER,
+    MOST_STEPS,
+    Overlap,
+    decide_by_overlap,
+    drop_rate_for,
+    steps_for,
+)
 from kgs.fit.plan import FEW, MANY, make_plan
 from kgs.fit.prune import left_out
 from kgs.fit.run import fit_scene
@@ -35,24 +43,35 @@ def points_seen_by(photos: float, views: int = 8, count: int = 1000):
     return InitialPoints(cloud, torch.full((50, 3), 0.5), "dense", patches)
 
 
-def test_steps_rise_and_the_rate_falls_with_the_photos_that_show_a_place():
+def test_steps_rise_and_the_rate_falls_with_the_photos_that_show_the_same_places():
     photos = torch.linspace(1.0, 12.0, 111).tolist()
     steps = [steps_for(n) for n in photos]
     rates = [drop_rate_for(n) for n in photos]
     assert steps == sorted(steps)
     assert rates == sorted(rates, reverse=True)
-    assert (steps_for(FEW_PHOTOS), drop_rate_for(FEW_PHOTOS)) == (FEW.steps, DROP)
-    assert (steps_for(12.0), drop_rate_for(MANY_PHOTOS)) == (MOST_STEPS, 0.0)
-    assert 0 < drop_rate_for(0.5 * (FEW_PHOTOS + MANY_PHOTOS)) < DROP
+    assert (steps_for(1.0), steps_for(3.0), steps_for(12.0)) == (FEW.steps, FEW.steps, MOST_STEPS)
+    assert (drop_rate_for(FEW_TOGETHER), drop_rate_for(MANY_TOGETHER)) == (DROP, 0.0)
+    assert 0 < drop_rate_for(0.5 * (FEW_TOGETHER + MANY_TOGETHER)) < DROP
+
+
+def test_photos_that_show_two_patches_are_counted_over_all_pairs():
+    visible = torch.rand(40, 6, generator=torch.Generator().manual_seed(1)) < 0.6
+    patches = PatchColors(torch.zeros(40, 6, 3), visible, torch.zeros(40, 6, 3))
+    pairs = [int((one & other).sum()) for one in visible for other in visible]
+    overlap = Overlap.of(patches)
+    assert overlap.together == pytest.approx(sum(pairs) / len(pairs))
+    assert overlap.photos == pytest.approx(float(visible.sum(1).double().mean()))
 
 
 @pytest.mark.parametrize("photos", [3.0, 5.0, 8.0])
 def test_what_is_open_is_decided_by_the_patches(scene, photos):
     plan = decide_by_overlap(make_plan(scene, OPEN), points_seen_by(photos))
-    chosen = {"steps": steps_for(photos), "drop": drop_rate_for(photos)}
+    together = Overlap.of(points_seen_by(photos).patches).together
+    chosen = {"steps": steps_for(photos), "drop": drop_rate_for(together)}
     assert plan.config == replace(make_plan(scene, OPEN).config, **chosen)
     assert plan.times.steps == chosen["steps"]
-    found = {"overlap": {"photos": pytest.approx(photos), "n": 1000, **chosen}}
+    numbers = {"photos": pytest.approx(photos), "together": pytest.approx(together, abs=0.01)}
+    found = {"overlap": {**numbers, "n": 1000, **chosen}}
     assert json.loads(json.dumps(plan.needs)) == found
     assert ("dropping" in left_out(plan.needs)) == (chosen["drop"] == 0)
     assert (Trainer(scene, plan, points_seen_by(photos)).state.drop is None) == (chosen["drop"] == 0)
@@ -97,6 +116,6 @@ def test_a_whole_fit_says_what_it_decided():
     large = synthetic_scene("room", train_views=8, test_views=1, size=(96, 128))
     fit = fit_scene(large, FitConfig(steps=4, evaluations=1))
     found = fit.history["needs"]["overlap"]
-    assert 3 <= found["photos"] <= 8
-    assert found["drop"] == fit.settings.drop == pytest.approx(drop_rate_for(found["photos"]), abs=0.01)
+    assert 3 <= found["together"] <= found["photos"] <= 8
+    assert found["drop"] == fit.settings.drop == pytest.approx(drop_rate_for(found["together"]), abs=0.01)
     assert "steps" not in found
