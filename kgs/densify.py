@@ -213,12 +213,16 @@ class Densifier:
         self._replace("opacity_logits", lowered, no_rows)
 
     @torch.no_grad()
-    def decay_opacity(self, factor: float) -> None:
-        """Multiply all opacities by `factor`, in (0, 1) (else a ValueError), in place; Adam's moments stay."""
+    def decay_opacity(self, factor: float, rows: Tensor | None = None) -> None:
+        """Multiply opacities by `factor`, in (0, 1) (else a ValueError), in place; Adam's moments stay.
+
+        `rows`, bool `(N,)`, are the Gaussians whose opacities are meant; None: all.
+        """
         if not 0.0 < factor < 1.0:
             raise ValueError(f"factor: expected a number in (0, 1), got {factor}")
         logits = self.model.opacity_logits  # of f s(x): log f - log(e^-x + 1 - f)
-        logits.copy_(math.log(factor) - torch.logaddexp(-logits, logits.new_full((), 1.0 - factor).log()))
+        decayed = math.log(factor) - torch.logaddexp(-logits, logits.new_full((), 1.0 - factor).log())
+        logits.copy_(decayed if rows is None else torch.where(rows.to(logits.device), decayed, logits))
 
     def state_dict(self) -> dict[str, Tensor]:
         """The statistics and the generator's state, for a checkpoint."""

@@ -65,6 +65,8 @@ class Recipe:
         opacity_decay: factor on all opacities after each step, in (0, 1]; it does not depend on the number of steps.
             None: 0.9925 for up to three training views and 1000 steps, else 0.995.
         decay_from: share of the steps after which this decay begins, in [0, 1].
+        haze_interval: steps between two looks for Gaussians that veil a training view, whose opacities are halved, see
+            :mod:`kgs.fit.haze`; none in the last tenth of the steps. 0: none at all.
         reset_interval: steps between two resets of all opacities; 0: none.
         reset_opacity: a reset lowers larger opacities to this; with resets more than `prune_opacity`.
         reset_recovery: a reset is skipped if fewer steps than this follow before the next one or the end.
@@ -92,6 +94,7 @@ class Recipe:
     prune_opacity: _Share = 0.02
     opacity_decay: Annotated[float | None, _Range(0, 1, "(]")] = None
     decay_from: _Share = 0.05
+    haze_interval: _Count = 1000
     reset_interval: _Count = 0
     reset_opacity: Annotated[float, _Range(0, 1, "()")] = 0.01
     reset_recovery: _Count = 300
@@ -256,6 +259,7 @@ PAPER = FitConfig(
         absgrad=False,
         prune_opacity=0.005,
         opacity_decay=1.0,
+        haze_interval=0,
         reset_interval=3000,
         alpha_threshold=1 / 255,
     ),

@@ -22,6 +22,7 @@ class Timetable(NamedTuple):
     sh: tuple[int, ...]  # before these one more degree of harmonics is switched on
     densify: tuple[int, ...]  # after these Gaussians are cloned, split and pruned
     reset: tuple[int, ...]  # after these all opacities are lowered
+    haze: tuple[int, ...]  # after these Gaussians that veil a training view fade
     evaluate: tuple[int, ...]  # after these the curve is measured (before a densification)
     drop: int  # up to this one Gaussians are dropped
     coarse: int  # up to this one the training views are seen at half their width
@@ -102,7 +103,8 @@ def timetable(config: FitConfig) -> Timetable:
     """Scale the recipe's counts by steps / `recipe.steps`.
 
     A short fit shortens the densification interval only as far as it needs to densify about 20 times, and never below
-    10 steps: with mean gradients over few steps the number of Gaussians explodes. `reset_recovery` skips resets.
+    10 steps: with mean gradients over few steps the number of Gaussians explodes. `reset_recovery` skips resets. Looks
+    for haze are at least 50 steps apart: before that a fit is too rough to tell a veil from what is not fitted yet.
     A `steps` of None counts as that of a fit to more than three views.
     """
     recipe = config.recipe
@@ -111,12 +113,14 @@ def timetable(config: FitConfig) -> Timetable:
     interval = max(10, round(min(recipe.densify_interval, steps / 20) * max(1.0, scale)))
     spacing = max(1, round(recipe.reset_interval * scale)) if recipe.reset_interval else steps
     resets = [*range(spacing, steps, spacing), steps]
+    looks = max(50, round(recipe.haze_interval * scale)) if recipe.haze_interval else steps
     evaluations = range(1, config.evaluations + 1)
     return Timetable(
         steps=steps,
         sh=tuple(max(1, round(recipe.sh_interval * scale * k)) for k in range(1, (config.sh_degree or 0) + 1)),
         densify=tuple(s for s in range(interval, steps, interval) if s > round(recipe.densify_from * scale)),
         reset=tuple(s for s, following in pairwise(resets) if following - s >= recipe.reset_recovery),
+        haze=tuple(range(looks, round(0.9 * steps) + 1, looks)),
         evaluate=tuple(sorted({max(1, round(steps * k / config.evaluations)) for k in evaluations})),
         drop=steps - min(config.undropped_steps, round(0.1 * steps)),
         coarse=round((config.coarse or 0.0) * steps),

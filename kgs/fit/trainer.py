@@ -33,6 +33,7 @@ from .config import FitConfig
 from .divergence import bound_scales, gradient_fault, parameter_fault, scale_fault, step_fault
 from .exposure import with_exposure
 from .fit import Fit
+from .haze import FADE, veils
 from .plan import Plan, make_plan
 from .poses import decayed, place_cameras
 from .state import TrainState, check_saved, fingerprint, state_errors
@@ -175,6 +176,9 @@ class Trainer:
         if state.step in times.evaluate:  # before densifying: right after it the image is 2 dB worse for a while
             self._measure_curve()
         start = time.perf_counter()
+        if state.step in times.haze:
+            with threads_beside(self.plan.backend):
+                state.densifier.decay_opacity(FADE, veils(self.result()))
         if state.step in times.densify:
             with threads_beside(self.plan.backend):
                 self._densify()
