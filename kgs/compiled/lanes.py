@@ -168,6 +168,33 @@ where_at_least = _where(">=")
 
 
 @intrinsic
+def bits_above(typingctx: Any, x: Any, limit: Any) -> Any:
+    """In which lanes x > limit, as bits of an int64: bit i is that of lane i."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        bits = builder.bitcast(_compare(">", builder, *args), ir.IntType(WIDTH))
+        return builder.zext(bits, ir.IntType(64))
+
+    return types.int64(lanes, lanes), generate
+
+
+@intrinsic
+def lowest(typingctx: Any, bits: Any) -> Any:
+    """The number of the lowest bit of an int64 that is set; 64 without any."""
+    return types.int64(types.int64), lambda context, builder, sig, args: builder.cttz(args[0], ir.IntType(1)(0))
+
+
+@intrinsic
+def highest(typingctx: Any, bits: Any) -> Any:
+    """The number of the highest bit of an int64 that is set; -1 without any."""
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.sub(ir.IntType(64)(63), builder.ctlz(args[0], ir.IntType(1)(0)))
+
+    return types.int64(types.int64), generate
+
+
+@intrinsic
 def spread(typingctx: Any, x: Any) -> Any:
     """The same number in all lanes."""
     return lanes(lanes), lambda context, builder, sig, args: args[0]
@@ -191,6 +218,28 @@ def totals(typingctx: Any, values: Any) -> Any:
         return _fold(builder, cgutils.unpack_tuple(builder, args[0]))
 
     return lanes(values), generate
+
+
+@intrinsic
+def columns(typingctx: Any, array: Any, first: Any) -> Any:
+    """The first eight columns of sixteen rows of memory, a tuple of lanes; the rows begin at position `first`."""
+    lower_half = types.UniTuple(lanes, WIDTH // 2)
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        start = _pointer(context, builder, sig, args)
+        rows = [builder.load(builder.gep(start, [ir.Constant(ir.IntType(32), i)])) for i in range(WIDTH)]
+        for row in rows:
+            row.align = 4
+        for size in (8, 4, 2, 1):  # of the blocks off the diagonal, which change places
+            left = [j if not j & size else WIDTH + j - size for j in range(WIDTH)]
+            right = [j + size if not j & size else WIDTH + j for j in range(WIDTH)]
+            for i in range(WIDTH):
+                if not i & size:
+                    x, y = rows[i], rows[i + size]
+                    rows[i], rows[i + size] = _shuffle(builder, x, y, left), _shuffle(builder, x, y, right)
+        return context.make_tuple(builder, sig.return_type, rows[: WIDTH // 2])
+
+    return lower_half(array, first), generate
 
 
 def _fold(builder: Any, vectors: Any) -> Any:

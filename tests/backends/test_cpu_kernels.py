@@ -18,6 +18,7 @@ from kgs.backends.cpu import binning_kernels, loss_kernels, projection_kernels  
 from kgs.backends.cpu import compositing_kernels as kernels  # noqa: E402  # needs numba
 from kgs.backends.cpu.binning import TileCoverage  # noqa: E402  # needs numba
 from kgs.compiled.arrays import arrays  # noqa: E402  # needs numba
+from kgs.compiled.lanes import WIDTH, load, store  # noqa: E402  # needs numba
 from kgs.init_points import matching_kernels  # noqa: E402  # needs numba
 
 
@@ -61,6 +62,85 @@ def test_rows_hold_what_was_counted(max_spans):
     assert coverage.spans_per_row.tolist() == [len(coverage.row_slice(row, row + 1).spans) for row in range(12)]
 
 
+def layers_of_a_chunk(seed, n):
+    """Rows as of a table about the centre of a tile: of all sizes and opacities, round and thin, near and far."""
+    generator = np.random.default_rng(seed)
+    rows = np.zeros((kernels.K, kernels.ROW), np.float32)
+    rows[:, 0] = generator.uniform(-9.0, 2.0, kernels.K)
+    rows[:, 1:3] = generator.normal(size=(kernels.K, 2)) * 10.0 ** generator.uniform(-1.0, 6.0, (kernels.K, 1))
+    along, across = 10.0 ** generator.uniform(-3.0, 1.0, (2, kernels.K))
+    slope, wide = generator.uniform(-1.0, 1.0, kernels.K), generator.random(kernels.K) < 0.5
+    rows[wide, 3:7] = np.stack([slope * across, across, along, 0.0 * along], 1)[wide]
+    rows[~wide, 3:7] = np.stack([across, slope * across, 0.0 * along, along], 1)[~wide]
+    on_the_axis = generator.random(kernels.K) < 0.5  # far away, and thin, and through the tile
+    rows[on_the_axis & wide, 2] = (-slope * rows[:, 1])[on_the_axis & wide]
+    rows[on_the_axis & ~wide, 1] = (-slope * rows[:, 2])[on_the_axis & ~wide]
+    rows[n:] = np.nan
+    return rows
+
+
+@nb.njit
+def strips_and_alphas(layers, n, threshold, pixels, strips, alphas):
+    kernels.place_pixels(pixels)
+    kernels.find_strips(layers, n, np.float32(np.log2(threshold)), strips)
+    for k in range(n):
+        for p in range(0, kernels.P, WIDTH):
+            alpha = kernels.alpha_of(layers, k, load(pixels, p), load(pixels, kernels.P + p), threshold)
+            store(alphas, k * kernels.P + p, alpha)
+
+
+def find_strips(rows, n, threshold):
+    """For each of n layers and the strips of a tile: whether it is found, and its largest alpha."""
+    strips = np.empty(kernels.STRIPS, np.int64)
+    alphas = np.empty(kernels.K * kernels.P, np.float32)
+    pixels = np.empty(2 * kernels.P, np.float32)
+    strips_and_alphas(rows.reshape(-1), n, np.float32(threshold), pixels, strips, alphas)
+    assert not (strips >> n).any()
+    found = (strips[None] >> np.arange(n)[:, None]) & 1 == 1
+    return found, alphas.reshape(kernels.K, kernels.STRIPS, -1)[:n].max(2)
+
+
+@pytest.mark.parametrize("n", [1, 16, 17, 32])
+@pytest.mark.parametrize("threshold", [TH, 0.5, kernels.TINY])
+def test_strips_where_an_alpha_counts_are_found(threshold, n):
+    missed = 0
+    for seed in range(100):
+        found, alphas = find_strips(layers_of_a_chunk(seed, n), n, threshold)
+        assert not alphas[~found].any()
+        missed += (~found).sum()
+    assert missed > 50 * n  # of 400 n
+
+
+def test_strips_are_found_that_are_reached_by_a_rounding():
+    for seed in range(300):
+        rows = layers_of_a_chunk(seed, kernels.K)
+        rows[:, 0] = 0.0
+        _, alphas = find_strips(rows, kernels.K, kernels.TINY)
+        alpha = np.maximum(alphas[:, seed % kernels.STRIPS], kernels.TINY)
+        rows[:, 0] = np.log2(TH) - np.log2(alpha.astype(np.float64))  # the largest alpha of this strip is the threshold
+        found, alphas = find_strips(rows, kernels.K, TH)
+        assert not alphas[~found].any()
+
+
+def test_a_strip_beside_the_ellipse_is_not_found():
+    rows = np.zeros((kernels.K, kernels.ROW), np.float32)
+    rows[:, 3] = rows[:, 6] = 1.0  # alpha is 2^-(dx^2 + dy^2)
+    rows[0, 2] = -3.5 + 1.99  # the last row of the first strip is less than a pixel above, the next less than 3 below
+    rows[1, 1], rows[1, 2] = 5.6, -3.5  # 2.1 beside the tile
+    rows[2, 1] = 5.4
+    found, _ = find_strips(rows, 3, 2.0**-4)
+    assert found.tolist() == [[True, True, False, False], [False] * 4, [False, True, True, False]]
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 3e38, -3e38])
+@pytest.mark.parametrize("column", range(7))
+def test_strips_are_found_whatever_is_not_finite(column, bad):
+    rows = layers_of_a_chunk(0, kernels.K)
+    rows[:, column] = bad
+    found, alphas = find_strips(rows, kernels.K, TH)
+    assert not alphas[~found].any()
+
+
 FLOATS = r"(?:fn?m(?:add|sub)\d*|mul|add|sub)"
 PACKED = rf"\tv?{FLOATS}ps\b.*[yz]mm|\tf(?:mla|mls|mul|add|sub)(?:\.4s|\tv\d+\.4s)"  # x86, arm
 SCALAR = rf"\tv?{FLOATS}ss\b|\tf(?:n?m(?:add|sub)|mul|add|sub)\ts\d"
@@ -74,7 +154,8 @@ def test_pixels_are_the_lanes(kernel):
     types = {"grid": nb.types.UniTuple(i8, 2), "offsets": i8[::1], "entries": nb.int32[::1], "table": f[:, ::1]}
     types |= {"threshold": f, "stop": f, "channels": nb.types.UniTuple(i8, 3)}
     types |= dict.fromkeys(("transmittance", "depths", "grad_transmittance"), f[:, :, ::1])
-    types |= {"starts": f[:, ::1], "reached": i8[::1], "grads": f[:, :, :, ::1], "needs_absolute": nb.boolean}
+    types |= {"starts": f[:, ::1], "strips": i8[:, ::1], "reached": i8[::1]}
+    types |= {"grads": f[:, :, :, ::1], "needs_absolute": nb.boolean}
     types |= {"sums": f[:, :, :, ::1] if kernel is kernels.composite_forward else f[:, ::1]}
     names = kernel.py_func.__code__.co_varnames[: kernel.py_func.__code__.co_argcount]
     text = assembly(kernel, *(types.get(name, i8) for name in names))

@@ -118,3 +118,39 @@ def test_totals_add_up_each_of_several_lanes(count):
     np.testing.assert_allclose(out[:count], sums, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(single, sums[0], rtol=1e-5, atol=1e-5)
     assert not out[count:].any()
+
+
+def test_bits_say_which_lanes_are_above_a_limit():
+    @nb.njit
+    def run(x, limit):
+        return lanes.bits_above(load(x, 0), load(limit, 0))
+
+    x, limit = numbers(1), numbers(1, seed=1)
+    x[:3] = np.nan, np.inf, limit[2]
+    limit[5] = np.nan
+    assert run(x, limit) == sum(1 << i for i in range(WIDTH) if x[i] > limit[i])
+
+
+@pytest.mark.parametrize("bits", [1, 0b1011000, 1 << 31, (1 << 32) - 1, 1 << 62, 0])
+def test_the_lowest_and_the_highest_bit(bits):
+    @nb.njit
+    def run(bits):
+        return lanes.lowest(bits), lanes.highest(bits)
+
+    numbers_of_bits = [i for i in range(64) if bits >> i & 1] or [64, -1]
+    assert run(bits) == (numbers_of_bits[0], numbers_of_bits[-1])
+
+
+def test_columns_of_rows():
+    @nb.njit
+    def run(x, out):
+        c = lanes.columns(x, 3)
+        store(out, 0, c[0])
+        store(out, WIDTH, c[1])
+        store(out, 2 * WIDTH, c[4])
+        store(out, 3 * WIDTH, c[7])
+
+    x = np.concatenate([np.zeros(3, np.float32), numbers(WIDTH)])
+    out = np.empty(4 * WIDTH, np.float32)
+    run(x, out)
+    np.testing.assert_array_equal(out.reshape(4, WIDTH), x[3:].reshape(WIDTH, WIDTH)[:, [0, 1, 4, 7]].T)

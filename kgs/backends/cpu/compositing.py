@@ -27,6 +27,7 @@ class _Done:
 
     band: Band
     starts: Floats  # T at the beginning of each chunk
+    strips: NDArray[np.int64]  # which of its entries may reach each strip of the tile, as bits
     reached: NDArray[np.int64]  # how many entries of each tile were composited
 
 
@@ -39,10 +40,10 @@ class CpuCompositor(Compositor):
         options = call.options
         self._blocks = _blocks(features.shape[1])
         channels = sum(width for _, width in self._blocks)
-        # a span, and at most one member for it: number, row of the table, sums; an entry, and its share of kept T
+        # a span, and at most one member for it: number, row of the table, sums; an entry, and its share of what is kept
         sums_width = len(self._blocks) * kernels.ROW
         per_span = _NUMBER * (1 + 1 + table_width(channels, call.median_depth) + sums_width)
-        per_entry = _NUMBER * (1 + kernels.P // kernels.K)
+        per_entry = _NUMBER * (1 + kernels.P // kernels.K) + 8 * kernels.STRIPS // kernels.K  # int64
         inputs = (projected.means2d, projected.factors, projected.opacities, features)
         self._size = projected.image_size
         self._cameras = projected.num_cameras
@@ -125,13 +126,14 @@ class CpuCompositor(Compositor):
                 tiles = len(band.offsets) - 1
                 chunks = len(band.entries) // kernels.K + tiles if keep else 0
                 starts = array((chunks, kernels.P))
+                strips = np.empty((chunks, kernels.STRIPS), np.int64)
                 reached = np.empty(tiles, np.int64)
                 lists = (band.first_tile, self._coverage.grid, band.offsets, band.entries, band.table)
                 for first, width in self._blocks if len(sums) else self._blocks[:1]:
-                    out = (starts, reached, transmittance, median, sums)
+                    out = (starts, strips, reached, transmittance, median, sums)
                     kernels.composite_forward(*lists, self._threshold, self._stop, first, (0,) * width, *out)
                 if keep:
-                    done[b] = _Done(band, starts, reached)
+                    done[b] = _Done(band, starts, strips, reached)
 
         over(thread_count(), count, work, pieces=count)
         return part, done
@@ -152,7 +154,7 @@ class CpuCompositor(Compositor):
             for own in done[begin:end]:
                 band = own.band
                 lists = (band.first_tile, self._coverage.grid, band.offsets, band.entries, band.table)
-                of_band = (own.starts, own.reached, grads, grad_transmittance, needs_absolute)
+                of_band = (own.starts, own.strips, own.reached, grads, grad_transmittance, needs_absolute)
                 for (first, width), rows in zip(self._blocks, sums, strict=True):
                     rows[band.members] = 0.0
                     block = (self._threshold, self._stop, first, (0,) * width)

@@ -1,9 +1,10 @@
 """Front-to-back compositing of the lists of a band, and its gradient; formulas as in `kgs.backends.torch`.
 
-A tile is P pixels, four times the `Lanes` of a kernel: two rows at a time. T is kept at the beginning of every chunk of
-K entries; the backward pass goes from chunk to chunk, back to front, and computes alphas and T of each again, with the
-same bits. Features come in blocks that a kernel is compiled for: V is linear in the features and in dL/dT, so blocks
-are differentiated one after the other, and their moments are added.
+A tile is P pixels, four times the `Lanes` of a kernel: four strips of two rows. Of the K entries of a chunk a strip
+takes those that may reach it, see `find_strips`. T is kept at the beginning of every chunk; the backward pass goes from
+chunk to chunk, back to front, and computes alphas and T of each again, with the same bits. Features come in blocks that
+a kernel is compiled for: V is linear in the features and in dL/dT, so blocks are differentiated one after the other,
+and their moments are added.
 
 What the kernels take, for C cameras, T tiles of a band and blocks of F features:
 
@@ -13,6 +14,7 @@ What the kernels take, for C cameras, T tiles of a band and blocks of F features
     feature                               where the block of features begins
     channels                              any tuple of as many numbers as the block has features
     starts                                (chunks, P), T at the beginning of each chunk; or empty
+    strips                                (chunks, STRIPS), what `find_strips` found for each chunk; or empty
     reached                               (T,), how many entries of each tile were composited
     transmittance, depths                 (C, H, W), the latter the median depth; or empty
     sums                                  (C, features, H, W); in the backward pass (members, ROW) of a block:
@@ -20,12 +22,18 @@ What the kernels take, for C cameras, T tiles of a band and blocks of F features
     grads, grad_transmittance             (C, features, H, W) and (C, H, W), derivatives of the loss
 """
 
+import math
+
 import numpy as np
 
 from kgs.compiled.kernel import HALF, ONE, ZERO, exp2, f32, inline, is_finite, jit, scratch
 from kgs.compiled.lanes import (
     WIDTH,
+    bits_above,
+    columns,
+    highest,
     load,
+    lowest,
     magnitude,
     maximum,
     minimum,
@@ -41,6 +49,7 @@ from kgs.compiled.lanes import (
 from .binning_kernels import SIZE, variances
 
 P = SIZE * SIZE
+STRIPS = P // WIDTH
 K = 32
 WIDTHS = (3, 4, 8)  # of blocks of features
 ROW = WIDTH  # numbers of a row of the table, and of sums of a member and a block
@@ -52,6 +61,7 @@ _ALPHA_MAX = f32(0.99)
 _FLOOR = f32(-126.0)  # of the exponent to base 2: below it floats are denormal
 _CENTRE = f32(0.5 * (SIZE - 1))
 TWICE_LN2 = f32(1.3862943611198906)  # of the derivative of the exponent to base 2, by the whitening vectors
+_MARGIN, _MARGIN_FAR, _WIDER = f32(1e-3), f32(2.0**-30), f32(1.0 + 2.0**-9)  # see `find_strips`
 _BLOCK = 64
 
 
@@ -72,6 +82,40 @@ def gather(table, entries, first, n, corner, feature, channels, layers):
         if feature > 0:
             for f in range(channels):
                 layers[k * ROW + 7 + f] = row[7 + feature + f]
+
+
+@inline
+def find_strips(layers, n, least, strips):
+    """Set bit k of `strips[s]`, for the n layers of a chunk, where layer k may reach strip s: elsewhere its alpha is 0.
+
+    With log2 alpha = l - |v|^2, v = W (dx, dy), and `least` the log2 of the threshold, a layer reaches a pixel where
+    |v|^2 <= l - least. On a row, dy is given, and |v|^2 is least at dx = -dy (w0 . w1) / (w0 . w0), w0 and w1 being the
+    columns of W, or at the end of the row that is closer to it. A strip is missed where both of its rows are.
+
+    What is missed must be 0 with all roundings, so the bound is wider. Let M^2 = far_x^2 |w0|^2 + far_y^2 |w1|^2 with
+    the largest |dx| and |dy| of the tile, and u = 2^-24. Here and in `alpha_of`, together, the error of v is below
+    e = 8 sqrt(2) u M, and |v|^2 >= (1 - t) |v + e|^2 - e^2 / t for any t; with t = 2^-10, e^2 / t is 2^-31 M^2. The
+    other roundings, of the exponent, of 2^x and of `least`, are below 1e-4. A bound that is not a number or infinite is
+    exceeded by nothing, and all strips are reached. A feature, or a derivative of the loss, that is not finite
+    therefore spreads to all pixels of the strips that its layer reaches, but not beyond.
+    """
+    for s in range(STRIPS):
+        strips[s] = 0
+    for first in range(0, n, WIDTH):
+        exponent, x, y, ax, ay, bx, by, _ = columns(layers, first * ROW)
+        xx, yy = ax * ax + bx * bx, ay * ay + by * by
+        slope = (ax * ay + bx * by) / xx
+        far_x, far_y = magnitude(x) + _CENTRE, magnitude(y) + _CENTRE
+        bound = exponent - least + _MARGIN + _MARGIN_FAR * (far_x * far_x * xx + far_y * far_y * yy)
+        bound = bound * _WIDER
+        for row in range(SIZE):
+            dy = f32(row) - _CENTRE - y
+            dx = minimum(maximum(ZERO - slope * dy, ZERO - _CENTRE - x), _CENTRE - x)
+            va, vb = dx * ax + dy * ay, dx * bx + dy * by
+            missed = bits_above(va * va + vb * vb, bound)
+            strips[row * STRIPS // SIZE] |= (missed ^ 0xFFFF) << first
+    for s in range(STRIPS):
+        strips[s] &= (1 << n) - 1  # what lies behind them in memory
 
 
 @inline
@@ -104,7 +148,7 @@ def keep_color(f, F, color, s, p):
 
 @jit
 def composite_forward(
-    first_tile, grid, offsets, entries, table, threshold, stop, feature, channels, starts, reached,
+    first_tile, grid, offsets, entries, table, threshold, stop, feature, channels, starts, strips, reached,
     transmittance, depths, sums,
 ):  # fmt: skip
     """A block of features: sums over layers, transmittance and median depth, straight into the images."""
@@ -112,6 +156,8 @@ def composite_forward(
     F, median = len(channels), len(depths) > 0
     pixels = scratch(2 * P)
     place_pixels(pixels)
+    least = f32(math.log2(threshold))
+    found = np.empty(STRIPS, np.int64)
     s = scratch((2 + F) * P)  # T, sums, depth of the last layer before which T was at least one half
     layers = scratch(K * ROW)
     corner = scratch(ROW)  # what a row of the table is about
@@ -136,9 +182,13 @@ def composite_forward(
             if keep:
                 for p in range(P):
                     starts[chunk, p] = s[p]
-                chunk += 1
             n = min(K, last - e)
             gather(table, entries, e, n, corner, feature, F, layers)
+            find_strips(layers, n, least, found)
+            if keep:
+                for i in range(STRIPS):
+                    strips[chunk, i] = found[i]
+            chunk += 1
             for p in range(0, P, WIDTH):
                 x = load(pixels, p)
                 y = load(pixels, P + p)
@@ -153,7 +203,10 @@ def composite_forward(
                 c5 = load(s, (1 + min(5, F)) * P + p)
                 c6 = load(s, (1 + min(6, F)) * P + p)
                 c7 = load(s, (1 + min(7, F)) * P + p)
-                for k in range(n):
+                bits = (1 << n) - 1 if median else found[p // WIDTH]  # the median depth is that of any layer
+                while bits != 0:
+                    k = lowest(bits)
+                    bits &= bits - 1
                     alpha = alpha_of(layers, k, x, y, threshold)
                     if median:
                         depth = where_at_least(before, HALF, table[entries[e + k], last_column], depth)
@@ -190,13 +243,13 @@ def composite_forward(
 
 @jit
 def composite_backward(
-    first_tile, grid, offsets, entries, table, threshold, stop, feature, channels, starts, reached,
+    first_tile, grid, offsets, entries, table, threshold, stop, feature, channels, starts, strips, reached,
     grads, grad_transmittance, needs_absolute, sums,
 ):  # fmt: skip
     """For each member the six moments of dL/d ln alpha about its centre, and dL/d features, added to `sums`.
 
-    The sums of |dL/d mean| are computed where they are needed. `starts` and `reached` are as `composite_forward` left
-    them; `grad_transmittance` is used with the first block.
+    The sums of |dL/d mean| are computed where they are needed. `starts`, `strips` and `reached` are as
+    `composite_forward` left them; `grad_transmittance` is used with the first block.
     """
     height, width = grad_transmittance.shape[1], grad_transmittance.shape[2]
     F = len(channels)
@@ -208,8 +261,7 @@ def composite_backward(
     corner = scratch(ROW)  # what a row of the table is about
     corner[:] = ZERO
     alphas = scratch(K * P)  # of each layer of a chunk, later dL/d ln alpha
-    weights = scratch(K * P)
-    after = scratch(K * P)  # T
+    weights = scratch(K * P)  # at first T before each layer
     for t in range(len(reached)):
         count = reached[t]
         if count == 0:
@@ -233,26 +285,42 @@ def composite_backward(
             n = min(K, count - chunk * K)
             gather(table, entries, base, n, corner, feature, F, layers)
             start = starts[offsets[t] // K + t + chunk]
+            found = strips[offsets[t] // K + t + chunk]
             for p in range(0, P, WIDTH):
                 x = load(pixels, p)
                 y = load(pixels, P + p)
                 before = load(start, p)
-                for k in range(n):
+                bits = ((1 << n) - 1) ^ found[p // WIDTH]
+                while bits != 0:
+                    k = lowest(bits)
+                    bits &= bits - 1
+                    store(alphas, k * P + p, spread(ZERO))
+                    store(weights, k * P + p, spread(ZERO))
+                bits = found[p // WIDTH]
+                while bits != 0:
+                    k = lowest(bits)
+                    bits &= bits - 1
                     alpha = alpha_of(layers, k, x, y, threshold)
                     store(alphas, k * P + p, alpha)
-                    store(weights, k * P + p, alpha * where_at_least(before, stop, before, ZERO))
+                    store(weights, k * P + p, before)
                     before = multiply_add(before, ZERO - alpha, before)
-                    store(after, k * P + p, before)
+                left = before
                 v = load(behind, p)
-                for k in range(n - 1, -1, -1):
+                bits = found[p // WIDTH]
+                while bits != 0:
+                    k = highest(bits)
+                    bits ^= 1 << k
                     value = load(g, p) * layers[k * ROW + 7]
                     for f in range(1, F):
                         value = value + load(g, f * P + p) * layers[k * ROW + 7 + f]
                     alpha = load(alphas, k * P + p)
-                    left = load(after, k * P + p)
+                    before = load(weights, k * P + p)
+                    weight = alpha * where_at_least(before, stop, before, ZERO)
                     step = value - where_at_least(left, stop, v, ZERO)
                     v = multiply_add(v, where_at_least(left, stop, ONE - alpha, ZERO), alpha * value)
-                    store(alphas, k * P + p, where_above(_ALPHA_MAX, alpha, load(weights, k * P + p) * step, ZERO))
+                    store(alphas, k * P + p, where_above(_ALPHA_MAX, alpha, weight * step, ZERO))
+                    store(weights, k * P + p, weight)
+                    left = before
                 store(behind, p, v)
             for k in range(n):
                 add_layer(k, F, needs_absolute, pixels, layers, alphas, weights, g, sums[entries[base + k]])
