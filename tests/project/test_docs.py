@@ -18,6 +18,9 @@ from tiny_scenes import narrow_lpips
 
 import kgs
 from kgs.fit.config import DETAILS, DROP, PRESETS, FitConfig
+from kgs.fit.haze import FRONT, HAZE, WINDOW
+from kgs.fit.overlap import MOST_STEPS, STEPS_OF_A_PHOTO
+from kgs.fit.plan import MANY as USUAL
 from kgs.fit.plan import with_pace
 from kgs.init_points.dense import FEWEST, MOST, MOST_OF_FEW_VIEWS, PIXELS_OF_A_POINT
 from kgs.metrics.lpips import Lpips
@@ -90,21 +93,21 @@ def test_the_examples_of_docstrings_do_what_they_say(module, tmp_path, monkeypat
 
 AUTO, PAPER, LOW, HIGH = FitConfig(), PRESETS["paper"], DETAILS["low"], DETAILS["high"]
 FEW, MANY = with_pace(AUTO, 3), with_pace(AUTO, 4)  # the default for up to three views, and for more
-STEPS_OF_BOTH = [FEW.steps, MANY.steps]
+STEPS_OF_BOTH = [FEW.steps, MOST_STEPS]
 # A page, what it says with a # for each number, and these numbers.
 NUMBERS = [
     ("README.md", "DropGaussian(p=#)", [PAPER.drop]),
     ("README.md", "whose rate grows to #, it gains", [DROP]),
     ("docs/layer.md", "The paper has p = #", [PAPER.drop]),
     ("docs/layer.md", "is p = #, with nothing dropped in the last #", [DROP, AUTO.undropped_steps]),
-    ("docs/comparison.md", "steps of a full run | # for up to three photos, # for more", STEPS_OF_BOTH),
+    ("docs/comparison.md", "steps of a full run | # for up to three photos, up to # for more", STEPS_OF_BOTH),
     ("docs/comparison.md", "initial points, of which there are # to #, or #", [FEWEST, MOST, MOST_OF_FEW_VIEWS]),
-    ("docs/how-to-photograph.md", "A fit takes # steps for up to three photos and # for more", STEPS_OF_BOTH),
+    ("docs/how-to-photograph.md", "A fit takes # steps for up to three photos and [up to # for more", STEPS_OF_BOTH),
     ("docs/measured.md", "three seeds): # steps from # of the same", [PAPER.steps, PAPER.init_points]),
-    ("docs/measured.md", "default, for # steps with three views and # with more", STEPS_OF_BOTH),
     ("docs/command.md", "| low | # | # | #, the", [LOW.size, LOW.entries["init_points"], LOW.entries["steps"]]),
     ("docs/command.md", "# to #, one for every # pixels", [FEWEST, MOST, PIXELS_OF_A_POINT]),
-    ("docs/command.md", "three photos to # | #, up to three photos #; for", [MOST_OF_FEW_VIEWS, MANY.steps, FEW.steps]),
+    ("docs/command.md", "three photos to # | # for up to three photos, for", [MOST_OF_FEW_VIEWS, FEW.steps]),
+    ("docs/command.md", "for more [# to #]", STEPS_OF_BOTH),
     ("docs/command.md", "| normal | # for unposed", [DETAILS["normal"].size]),
     ("docs/how-to-photograph.md", "and fitted at # on a CPU", [DETAILS["normal"].size]),
     ("docs/photos.md", "takes them at # pixels on a CPU", [DETAILS["normal"].size]),
@@ -113,6 +116,11 @@ NUMBERS = [
     ("docs/recipe.md", "times # (up to three", [FEW.recipe.opacity_decay]),
     ("docs/recipe.md", "or # after every step, from # % of", [MANY.recipe.opacity_decay, 100 * AUTO.recipe.decay_from]),
     ("docs/recipe.md", "| steps | #, here # | # for up", [PAPER.recipe.steps, PAPER.steps, FEW.steps]),
+    ("docs/recipe.md", "for up to three photos; for more, up to #", [MOST_STEPS]),
+    ("docs/recipe.md", "**Steps**: #, and # more for each", [FEW.steps, STEPS_OF_A_PHOTO]),
+    ("docs/recipe.md", "have no patches: then there are # steps", [USUAL.steps]),
+    ("docs/recipe.md", "by # in a window of #x7", [HAZE, WINDOW]),
+    ("docs/recipe.md", "lie nearer than # times the median", [FRONT]),
     ("docs/recipe.md", "| initial points | # of", [PAPER.init_points]),
     ("docs/recipe.md", "every # pixels on whose depth two views agree, # to #", [PIXELS_OF_A_POINT, FEWEST, MOST]),
     ("docs/recipe.md", "(up to three photos to #), each", [MOST_OF_FEW_VIEWS]),
