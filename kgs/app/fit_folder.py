@@ -138,7 +138,7 @@ def fit_folder(
                 discard_fit(work, say)
             raise
         folder = out
-        is_done = trainer.step >= plan.times.steps
+        is_done = trainer.step >= trainer.plan.times.steps
         if not is_done and (is_finished(out) or step_of(out) > trainer.step):
             folder = work
             kept = f"{printable(out)} keeps its {_state(out)}; this one is in {printable(work)}"
@@ -200,9 +200,10 @@ def _trainer(
     stages.begin("initial points")
     points = choose_points(scene, config, each)
     say(f"initial points: {len(points.points)} ({points.kind})")
+    plan = decide(plan, points)
     memory = expected_memory(scene, most_gaussians(plan.config, len(points.points)))
     say(f"the fit takes up to {memory / 2**30:.1f} GiB of memory")
-    return Trainer(scene, decide(plan, points), points), begin(out, "fit")
+    return Trainer(scene, plan, points), begin(out, "fit")
 
 
 def _resumed(scene: Scene, config: FitConfig, folders: list[Path], say: Callable[[str], None]) -> tuple[Trainer, Path]:

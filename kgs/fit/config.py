@@ -66,7 +66,7 @@ class Recipe:
             None: 0.9925 for up to three training views and 1000 steps, else 0.995.
         decay_from: share of the steps after which this decay begins, in [0, 1].
         haze_interval: steps between two looks for Gaussians that veil a training view, whose opacities are halved, see
-            :mod:`kgs.fit.haze`; none in the last tenth of the steps. 0: none at all.
+            :mod:`kgs.fit.haze`; at least 50, and none in the last tenth of the steps. 0: none at all.
         reset_interval: steps between two resets of all opacities; 0: none.
         reset_opacity: a reset lowers larger opacities to this; with resets more than `prune_opacity`.
         reset_recovery: a reset is skipped if fewer steps than this follow before the next one or the end.
@@ -119,10 +119,12 @@ class FitConfig:
     and all photos as equally exposed.
 
     Args:
-        steps: number of training steps, to which the recipe's counts are scaled. Unless given: 900 for up to three
-            views; for more, 275 more for each photo beyond the third that shows a place in the mean, 1800 at most.
+        steps: number of training steps, to which the recipe's counts are scaled. Unless given: 900; with more than
+            three views 275 more for each photo beyond the third that shows a place in the mean, 1800 at most, or 1100
+            if the initial points do not tell.
         drop: final rate of DropGaussian, in [0, 1); 0 leaves the layer out. Unless given: 0.3 where three photos or
-            fewer show two places at once in the mean, less where more do, and 0 from five on.
+            fewer show two places at once in the mean, or the initial points do not tell; less where more do, and 0 from
+            five on.
         drop_schedule: linear: the rate grows with the steps, as in the paper. constant: dropout at that rate.
         undropped_steps: number of last steps in which no Gaussian is dropped, at most a tenth of all.
         sh_degree: degree of the view-dependent colour (spherical harmonics), 0 to 3. Unless given: 3

@@ -6,14 +6,13 @@ where most photos show the same places it gains nothing. Patches of surface tell
 :class:`kgs.init_points.patches.PatchColors`.
 """
 
-from dataclasses import replace
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 from kgs.init_points import InitialPoints
 from kgs.init_points.patches import MIN_PATCHES, PatchColors
 
 from .config import DROP
-from .plan import FEW, Plan, timetable
+from .plan import FEW, Plan
 
 STEPS_OF_A_PHOTO = 275  # steps for each photo beyond the third that shows a place
 MOST_STEPS = 1800
@@ -25,12 +24,12 @@ class Overlap(NamedTuple):
     """How many photos show the same places.
 
     Args:
-        photos: that show a patch and agree on its depth, in the mean over the patches.
-        together: that show both of two patches, in the mean over all pairs of patches.
+        photos_per_place: how many show a patch and agree on its depth, in the mean over the patches.
+        photos_per_pair: how many show both of two patches, in the mean over all pairs of patches.
     """
 
-    photos: float
-    together: float
+    photos_per_place: float
+    photos_per_pair: float
 
     @classmethod
     def of(cls, patches: PatchColors) -> Self:
@@ -48,35 +47,30 @@ def decide_by_overlap(plan: Plan, points: InitialPoints) -> Plan:
 
     Returns:
         The plan with a rate, and with a number of steps. If the patches decided, its `needs` have under "overlap" a
-        dict: "photos" and "together" as in :class:`Overlap`, "n" (the number of patches), and of "steps" and "drop"
-        those that were decided. Without patches the rate is `DROP`, and the fit has the usual length.
+        dict: the numbers of :class:`Overlap`, "patches" (how many there are), and of "steps" and "drop" those that were
+        decided. Without patches the rate is `DROP`, and the fit has the usual length.
     """
     is_open = [name for name in ("steps", "drop") if getattr(plan.config, name) is None]
     if not is_open:
         return plan
     patches = points.patches
     if patches is None or len(patches) < MIN_PATCHES:
-        return _with(plan, {"steps": plan.times.steps, "drop": DROP}, is_open)
+        usual = {"steps": plan.times.steps, "drop": DROP}
+        return plan.decided({name: usual[name] for name in is_open}, {})
     overlap = Overlap.of(patches)
-    plan = _with(plan, {"steps": steps_for(overlap.photos), "drop": drop_rate_for(overlap.together)}, is_open)
-    found = {name: round(number, 2) for name, number in overlap._asdict().items()} | {"n": len(patches)}
-    found |= {name: getattr(plan.config, name) for name in is_open}
-    return replace(plan, needs={**plan.needs, "overlap": found})
+    chosen = {"steps": steps_for(overlap.photos_per_place), "drop": drop_rate_for(overlap.photos_per_pair)}
+    entries = {name: chosen[name] for name in is_open}
+    numbers = {name: round(number, 2) for name, number in overlap._asdict().items()}
+    return plan.decided(entries, {"overlap": {**numbers, "patches": len(patches), **entries}})
 
 
-def steps_for(photos: float) -> int:
-    """The number of steps where so many photos show a place, a multiple of 50."""
-    steps = FEW.steps + STEPS_OF_A_PHOTO * (photos - 3)
+def steps_for(photos_per_place: float) -> int:
+    """The number of steps where so many photos show a place, a multiple of 50; of three as in fits to three."""
+    steps = FEW.steps + STEPS_OF_A_PHOTO * (photos_per_place - 3)
     return min(max(50 * round(steps / 50), FEW.steps), MOST_STEPS)
 
 
-def drop_rate_for(together: float) -> float:
+def drop_rate_for(photos_per_pair: float) -> float:
     """The final rate of dropping where so many photos show two places at once, to two decimals."""
-    share = (MANY_TOGETHER - together) / (MANY_TOGETHER - FEW_TOGETHER)
+    share = (MANY_TOGETHER - photos_per_pair) / (MANY_TOGETHER - FEW_TOGETHER)
     return round(DROP * min(max(share, 0.0), 1.0), 2)
-
-
-def _with(plan: Plan, values: dict[str, Any], names: list[str]) -> Plan:
-    """The plan with these of the values in its settings."""
-    config = replace(plan.config, **{name: values[name] for name in names})
-    return replace(plan, config=config, times=timetable(config))

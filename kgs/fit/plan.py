@@ -59,10 +59,10 @@ class Plan:
     times: Timetable
     needs: dict[str, Any] = field(default_factory=dict)
 
-    def with_degree(self, sh_degree: int, why: dict[str, Any]) -> Self:
-        """The plan with harmonics of this degree; `why` goes into `needs`."""
-        config = replace(self.config, sh_degree=sh_degree)
-        return replace(self, config=config, times=timetable(config), needs={**self.needs, "sh_degree": why})
+    def decided(self, entries: dict[str, Any], needs: dict[str, Any]) -> Self:
+        """The plan with these entries of its configuration; why they were decided goes into `needs`."""
+        config = replace(self.config, **entries)
+        return replace(self, config=config, times=timetable(config), needs={**self.needs, **needs})
 
 
 def make_plan(scene: Scene, config: FitConfig) -> Plan:

@@ -246,8 +246,8 @@ def check_saved(saved: dict[str, Any], scene: dict[str, Any], config: FitConfig,
     if planned == done < steps:
         notes.append(
             f"trained on from step {done}, the end of a fit of {planned} steps: from here on learning rates, drop "
-            f"rate, densification and resets are those of {steps} steps, so that the result differs from a fit of "
-            f"{steps} steps from the start"
+            f"rate, densification, resets and looks for haze are those of {steps} steps, so that the result differs "
+            f"from a fit of {steps} steps from the start"
         )
     elif planned != steps or done > planned:
         expected = f"{planned}, as the fit was begun with," if done < planned else f"at least the {done} that are done,"
@@ -270,7 +270,9 @@ def check_saved(saved: dict[str, Any], scene: dict[str, Any], config: FitConfig,
 
 def _compare_settings(saved: dict[str, Any], asked: dict[str, Any], path: str = "") -> None:
     for name, value in asked.items():
-        before = saved.get(name)
+        if name not in saved:
+            raise ValueError(f"{path}{name}: expected a fit of this version of kgs, got one without this setting")
+        before = saved[name]
         if isinstance(value, dict) and isinstance(before, dict):
             _compare_settings(before, value, f"{path}{name}.")
         elif before != value:

@@ -272,7 +272,8 @@ class Trainer:
         values, damage = newest_checkpoint(Path(path))
         try:
             saved = values["config"]
-            decided = {name: saved[name] for name in ("steps", "sh_degree", "drop") if getattr(config, name) is None}
+            names = ["sh_degree", "drop", *(["steps"] if "steps" in values["needs"].get("overlap", {}) else [])]
+            decided = {name: saved[name] for name in names if getattr(config, name) is None}
             decay = config.recipe.opacity_decay
             if decay is None:  # more steps may have another
                 decay = saved["recipe"]["opacity_decay"]

@@ -56,8 +56,8 @@ def decide_degree(plan: Plan, points: InitialPoints) -> Plan:
         gain = possible_gain(patches)
         chosen = DEGREE if gain > MIN_GAIN else 0
         found = {"by": "photos", "over": DEGREE - chosen, "gain": round(gain, 3), "n": len(patches)}
-        return plan.with_degree(chosen, {"chosen": chosen, **found})
-    return plan.with_degree(0, {"chosen": 0, "by": "rule", "why": why})
+        return plan.decided({"sh_degree": chosen}, {"sh_degree": {"chosen": chosen, **found}})
+    return plan.decided({"sh_degree": 0}, {"sh_degree": {"chosen": 0, "by": "rule", "why": why}})
 
 
 def possible_gain(patches: PatchColors) -> float:

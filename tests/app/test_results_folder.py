@@ -383,6 +383,19 @@ def test_an_interrupted_fit_leaves_a_finished_one_in_its_place(scene: Any, done:
     assert folders(done) == ["test"]
 
 
+@pytest.mark.parametrize(("decided", "interrupted"), [(2, False), (6, True)])
+def test_a_fit_is_done_after_the_steps_that_the_photos_decided(
+    scene: Any, done: Path, monkeypatch: Any, decided: int, interrupted: bool
+) -> None:
+    """Not after those of the plan before, which are 3."""
+    monkeypatch.setattr(app, "decide", lambda plan, _: plan.decided({"steps": decided}, {}))
+    if interrupted:
+        interrupt_at(3, monkeypatch)
+    fit(scene, OTHER, done)
+    assert seed_of(done) == (0 if interrupted else 1)
+    assert folders(done) == (["test", "unfinished-1"] if interrupted else ["test"])
+
+
 def test_what_got_further_is_kept_until_one_is_further_or_done(scene: Any, tmp_path: Path, monkeypatch: Any) -> None:
     """The same command again and again, stopped at steps 4, 2, 5 of 7 and then never."""
     config = replace(CONFIG, steps=7)

@@ -210,6 +210,15 @@ def test_decay_multiplies_opacities():
     np.testing.assert_allclose(model.opacity_logits.detach().double().sigmoid(), 0.99 * before, rtol=2e-6)
 
 
+def test_decay_of_some_rows_leaves_the_others_their_bits():
+    model = random_model(6, 0)
+    rows = torch.tensor([True, False, False, True, False, False])
+    before = model.opacity_logits.detach().clone()
+    Densifier(model, torch.optim.Adam(model.parameters()), 1.0).decay_opacity(0.5, rows)
+    assert torch.equal(model.opacity_logits[~rows], before[~rows])
+    np.testing.assert_allclose(model.opacity_logits[rows].detach().sigmoid(), 0.5 * before[rows].sigmoid(), rtol=1e-5)
+
+
 def test_gaussians_that_are_all_pruned_can_decay():
     model = random_model(5, 0)
     with torch.no_grad():

@@ -126,7 +126,7 @@ def test_a_plan_has_what_the_configuration_leaves_open_but_for_the_degree():
 
 def test_a_degree_changes_the_timetable_and_says_why():
     first = make_plan(SCENE, FitConfig(steps=100))
-    plan = first.with_degree(2, {"by": "rule"})
+    plan = first.decided({"sh_degree": 2}, {"sh_degree": {"by": "rule"}})
     assert (plan.config.sh_degree, len(plan.times.sh)) == (2, 2)
     assert plan.needs == {"sh_degree": {"by": "rule"}}
     assert (first.config.sh_degree, first.times.sh, first.needs) == (None, (), {})

@@ -53,9 +53,34 @@ def test_only_what_brightens_dark_places_from_before_the_surface_is_a_veil(scene
 
 
 def test_pixels_that_do_not_count_tell_nothing(scene):
-    nothing = torch.zeros(3, 48, 64, dtype=torch.bool)
-    uncounted = replace(scene, train=replace(scene.train, counted=nothing))
-    assert not veils(wall(uncounted, opacity=0.2)).any()
+    fit = wall(scene, opacity=0.2)
+    counts = torch.ones(3, 48, 64, dtype=torch.bool)
+    assert veils(replace(fit, scene=replace(scene, train=replace(scene.train, counted=counts)))).any()
+    views, rows, columns = hazy_pixels(fit)
+    counts[views, rows, columns] = False
+    assert not veils(replace(fit, scene=replace(scene, train=replace(scene.train, counted=counts)))).any()
+
+
+def hazy_pixels(fit):
+    """Where a render differs from its photo by so much that it could count as hazy."""
+    views = fit.scene.train
+    renders = torch.cat([fit.render(views.camera(i)) for i in range(len(views))])
+    return ((renders - views.images).abs().amax(1) > 0.005).nonzero().unbind(1)
+
+
+def test_exposure_does_not_count_as_haze(scene):
+    gains = torch.tensor([[1.0, 1.0, 1.0], [1.5, 1.4, 1.3], [0.7, 0.8, 0.9]])
+    exposed = replace(scene.train, images=scene.train.images * gains[:, :, None, None], gains=gains)
+    assert not veils(wall(replace(scene, train=exposed))).any()
+    assert veils(wall(replace(scene, train=exposed), opacity=0.2))[-1]
+
+
+def test_a_bright_background_is_not_haze(scene):
+    fit = wall(replace(scene, background=torch.ones(3)))
+    with torch.no_grad():
+        fit.model.opacity_logits[:-1] = -0.5
+        fit.model.opacity_logits[-1] = -1.0
+    assert not veils(fit).any()
 
 
 def test_the_dark_channel_is_the_least_number_of_a_window():

@@ -59,19 +59,19 @@ def test_photos_that_show_two_patches_are_counted_over_all_pairs():
     patches = PatchColors(torch.zeros(40, 6, 3), visible, torch.zeros(40, 6, 3))
     pairs = [int((one & other).sum()) for one in visible for other in visible]
     overlap = Overlap.of(patches)
-    assert overlap.together == pytest.approx(sum(pairs) / len(pairs))
-    assert overlap.photos == pytest.approx(float(visible.sum(1).double().mean()))
+    assert overlap.photos_per_pair == pytest.approx(sum(pairs) / len(pairs))
+    assert overlap.photos_per_place == pytest.approx(float(visible.sum(1).double().mean()))
 
 
 @pytest.mark.parametrize("photos", [3.0, 5.0, 8.0])
 def test_what_is_open_is_decided_by_the_patches(scene, photos):
     plan = decide_by_overlap(make_plan(scene, OPEN), points_seen_by(photos))
-    together = Overlap.of(points_seen_by(photos).patches).together
+    together = Overlap.of(points_seen_by(photos).patches).photos_per_pair
     chosen = {"steps": steps_for(photos), "drop": drop_rate_for(together)}
     assert plan.config == replace(make_plan(scene, OPEN).config, **chosen)
     assert plan.times.steps == chosen["steps"]
-    numbers = {"photos": pytest.approx(photos), "together": pytest.approx(together, abs=0.01)}
-    found = {"overlap": {**numbers, "n": 1000, **chosen}}
+    numbers = {"photos_per_place": pytest.approx(photos), "photos_per_pair": pytest.approx(together, abs=0.01)}
+    found = {"overlap": {**numbers, "patches": 1000, **chosen}}
     assert json.loads(json.dumps(plan.needs)) == found
     assert ("dropping" in left_out(plan.needs)) == (chosen["drop"] == 0)
     assert (Trainer(scene, plan, points_seen_by(photos)).state.drop is None) == (chosen["drop"] == 0)
@@ -116,6 +116,6 @@ def test_a_whole_fit_says_what_it_decided():
     large = synthetic_scene("room", train_views=8, test_views=1, size=(96, 128))
     fit = fit_scene(large, FitConfig(steps=4, evaluations=1))
     found = fit.history["needs"]["overlap"]
-    assert 3 <= found["together"] <= found["photos"] <= 8
-    assert found["drop"] == fit.settings.drop == pytest.approx(drop_rate_for(found["together"]), abs=0.01)
+    assert 3 <= found["photos_per_pair"] <= found["photos_per_place"] <= 8
+    assert found["drop"] == fit.settings.drop == pytest.approx(drop_rate_for(found["photos_per_pair"]), abs=0.01)
     assert "steps" not in found

@@ -96,8 +96,8 @@ def find_strips(layers, n, least, strips):
     the largest |dx| and |dy| of the tile, and u = 2^-24. Here and in `alpha_of`, together, the error of v is below
     e = 8 sqrt(2) u M, and |v|^2 >= (1 - t) |v + e|^2 - e^2 / t for any t; with t = 2^-10, e^2 / t is 2^-31 M^2. The
     other roundings, of the exponent, of 2^x and of `least`, are below 1e-4. A bound that is not a number or infinite is
-    exceeded by nothing, and all strips are reached. A feature, or a derivative of the loss, that is not finite
-    therefore spreads to all pixels of the strips that its layer reaches, but not beyond.
+    exceeded by nothing, and all strips are reached. In the forward pass a feature that is not finite therefore spreads
+    to all pixels of the strips that its layer reaches, but not beyond.
     """
     for s in range(STRIPS):
         strips[s] = 0
@@ -113,7 +113,7 @@ def find_strips(layers, n, least, strips):
             dx = minimum(maximum(ZERO - slope * dy, ZERO - _CENTRE - x), _CENTRE - x)
             va, vb = dx * ax + dy * ay, dx * bx + dy * by
             missed = bits_above(va * va + vb * vb, bound)
-            strips[row * STRIPS // SIZE] |= (missed ^ 0xFFFF) << first
+            strips[row * STRIPS // SIZE] |= (missed ^ ((1 << WIDTH) - 1)) << first
     for s in range(STRIPS):
         strips[s] &= (1 << n) - 1  # what lies behind them in memory
 
