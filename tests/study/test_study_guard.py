@@ -85,7 +85,6 @@ def test_the_default_has_its_own_steps_and_the_paper_s_rule_few(cells):
     assert steps == {(AUTO, None), (AUTO_OFF, None), (PAPER, 700)}
 
 
-@pytest.mark.skipif(not STORED.exists(), reason="no cells are stored yet")
 def test_what_is_stored_are_the_cells_of_the_preset(cells):
     rows = read_rows(STORED)
     assert [row["cell"] for row in rows] == cells
