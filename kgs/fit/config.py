@@ -116,15 +116,13 @@ class FitConfig:
     `fit_scene` and the command use all entries. A `Trainer` is given its initial points and removes nothing after the
     last step: it ignores init, init_file, init_points, draw and keep_all. Unless :func:`kgs.fit.run.decide` was asked,
     it takes a `sh_degree` of None as 0, a `drop` of None as 0.3, a `steps` of None as 1100 with more than three views,
-    and all photos as equally exposed.
+    and all photos as equally exposed. :mod:`kgs.fit.overlap` has the numbers of steps and drop.
 
     Args:
-        steps: number of training steps, to which the recipe's counts are scaled. Unless given: 900; with more than
-            three views 275 more for each photo beyond the third that shows a place in the mean, 1800 at most, or 1100
-            if the initial points do not tell.
-        drop: final rate of DropGaussian, in [0, 1); 0 leaves the layer out. Unless given: 0.3 where three photos or
-            fewer show two places at once in the mean, or the initial points do not tell; less where more do, and 0 from
-            five on.
+        steps: number of training steps, to which the recipe's counts are scaled. Unless given: 900 for up to three
+            views; 900 to 1800 for more, by how many photos show a place.
+        drop: final rate of DropGaussian, in [0, 1); 0 leaves the layer out. Unless given: 0.3, and less, down to 0,
+            where many photos show the same places.
         drop_schedule: linear: the rate grows with the steps, as in the paper. constant: dropout at that rate.
         undropped_steps: number of last steps in which no Gaussian is dropped, at most a tenth of all.
         sh_degree: degree of the view-dependent colour (spherical harmonics), 0 to 3. Unless given: 3
