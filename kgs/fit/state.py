@@ -238,11 +238,10 @@ def check_saved(saved: dict[str, Any], scene: dict[str, Any], config: FitConfig,
     planned = saved["config"]["steps"] or MANY.steps
     done = saved["step"]
     notes = list[str]()
-    asked = config.to_dict() | {"device": saved["config"]["device"]}  # a fit may continue on another device
+    # a fit may continue on another device; its steps are compared below
+    asked = config.to_dict() | {name: saved["config"][name] for name in ("device", "steps")}
     if config.backend == "auto":
         asked["backend"] = saved["backend"]
-    if planned == steps or planned == done < steps:
-        asked["steps"] = saved["config"]["steps"]
     if planned == done < steps:
         notes.append(
             f"trained on from step {done}, the end of a fit of {planned} steps: from here on learning rates, drop "
