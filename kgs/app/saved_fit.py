@@ -95,9 +95,9 @@ def _read_model(path: Path, values: dict[str, Any]) -> GaussianModel:
 def _exposed(scene: Scene, path: Path, values: dict[str, Any]) -> Scene:
     """The scene, with the gains of the training photos that were decided."""
     try:
-        return with_exposure(scene, values.get("needs", {}))
+        return with_exposure(scene, values.get("decisions", {}))
     except (KeyError, TypeError, ValueError) as error:
-        raise DataError(path, "needs", f"expected the gains of {len(scene.train)} photos, got others") from error
+        raise DataError(path, "decisions", f"expected the gains of {len(scene.train)} photos, got others") from error
 
 
 def _place(scene: Scene, path: Path, values: dict[str, Any]) -> Scene:

@@ -41,7 +41,7 @@ def decide_exposure(plan: Plan, points: InitialPoints) -> Plan:
         points: its initial points; without patches there are no gains, and a warning if they were asked for.
 
     Returns:
-        The plan. If gains are used, its `needs` have under "exposure" a dict: "gains", three numbers for each
+        The plan. If gains are used, its `decisions` have under "exposure" a dict: "gains", three numbers for each
         training view, with a geometric mean of 1; "left", the share of the patches' differences that they leave; and
         "n", the number of patches.
     """
@@ -58,7 +58,7 @@ def decide_exposure(plan: Plan, points: InitialPoints) -> Plan:
         return plan
     rows = [[round(value, 4) for value in row] for row in gains.tolist()]
     exposure = {"gains": rows, "left": round(left, 3), "n": len(points.patches)}
-    return replace(plan, needs={**plan.needs, "exposure": exposure})
+    return replace(plan, decisions={**plan.decisions, "exposure": exposure})
 
 
 def estimate_gains(patches: PatchColors) -> tuple[Tensor, float]:
@@ -101,7 +101,7 @@ def _solve(weights: Tensor, logs: Tensor) -> Tensor:
     return found - found.mean()
 
 
-def with_exposure(scene: Scene, needs: dict[str, Any]) -> Scene:
+def with_exposure(scene: Scene, decisions: dict[str, Any]) -> Scene:
     """The scene whose training views have the gains that were decided; the same one where none were.
 
     Raises:
@@ -110,5 +110,5 @@ def with_exposure(scene: Scene, needs: dict[str, Any]) -> Scene:
     if "exposure" not in needs:
         return scene
     views = scene.train
-    gains = torch.tensor(needs["exposure"]["gains"], dtype=torch.float32)
+    gains = torch.tensor(decisions["exposure"]["gains"], dtype=torch.float32)
     return replace(scene, train=replace(views, gains=gains))

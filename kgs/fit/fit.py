@@ -30,7 +30,7 @@ class Fit:
         options: of the renderer.
         backend: of the renderer.
         settings: of the fit; None for a splat that is not one of kgs.
-        history: plain values for metrics.json: "steps", "seconds", "curve", "init", "needs", "poses".
+        history: plain values for metrics.json: "steps", "seconds", "curve", "init", "decisions", "poses".
         metrics: the content of metrics.json, once it is measured.
         notes: lines that a user should read.
         part: which of the trained Gaussians `model` has, after pruning: "rows", bool, and "sh_degree".

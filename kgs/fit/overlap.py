@@ -46,7 +46,7 @@ def decide_by_overlap(plan: Plan, points: InitialPoints) -> Plan:
         points: its initial points.
 
     Returns:
-        The plan with a rate, and with a number of steps. If the patches decided, its `needs` have under "overlap" a
+        The plan with a rate, and with a number of steps. If the patches decided, its `decisions` have under "overlap" a
         dict: the numbers of :class:`Overlap`, "patches" (how many there are), and of "steps" and "drop" those that were
         decided. Without patches the rate is `DROP`, and the fit has the usual length.
     """

@@ -50,19 +50,19 @@ class Plan:
         device: of the fit.
         backend: "numba", "triton" or "torch".
         times: the steps at which things happen.
-        needs: what was decided about the scene, and why, for metrics.json.
+        decisions: what was decided about the scene, and why, for metrics.json.
     """
 
     config: FitConfig
     device: torch.device
     backend: str
     times: Timetable
-    needs: dict[str, Any] = field(default_factory=dict)
+    decisions: dict[str, Any] = field(default_factory=dict)
 
-    def decided(self, entries: dict[str, Any], needs: dict[str, Any]) -> Self:
-        """The plan with these entries of its configuration; why they were decided goes into `needs`."""
+    def decided(self, entries: dict[str, Any], decisions: dict[str, Any]) -> Self:
+        """The plan with these entries of its configuration; why they were decided goes into `decisions`."""
         config = replace(self.config, **entries)
-        return replace(self, config=config, times=timetable(config), needs={**self.needs, **needs})
+        return replace(self, config=config, times=timetable(config), decisions={**self.decisions, **decisions})
 
 
 def make_plan(scene: Scene, config: FitConfig) -> Plan:

@@ -29,7 +29,7 @@ def prune(fit: Fit) -> Fit:
     Takes the highest limit of `WEIGHTS` that changes the PSNR of no training view by more than `TOLERANCE`, then the
     lowest degree of harmonics for which the same holds and which changes no pixel value by more than `QUANTUM`.
 
-    The history's "needs" then have under "gaussians" how many were "fitted" and "kept", the limit "weight", and
+    The history's "decisions" then have under "gaussians" how many were "fitted" and "kept", the limit "weight", and
     "sh_degree".
     """
     if fit.settings is not None and fit.settings.keep_all:
@@ -49,8 +49,8 @@ def prune(fit: Fit) -> Fit:
         "weight": limit,
         "sh_degree": pruned.part["sh_degree"],
     }
-    needs = {**fit.history["needs"], "gaussians": record}
-    return replace(pruned, history={**fit.history, "needs": needs})
+    decisions = {**fit.history["decisions"], "gaussians": record}
+    return replace(pruned, history={**fit.history, "decisions": needs})
 
 
 def _part(fit: Fit, rows: Tensor, sh_degree: int) -> Fit:
@@ -102,17 +102,17 @@ def contributions(model: GaussianModel, views: Views, options: RasterOptions, ba
     return torch.zeros_like(colors[:, 0]) if colors.grad is None else colors.grad[:, 0]
 
 
-def left_out(needs: dict[str, Any]) -> str:
+def left_out(decisions: dict[str, Any]) -> str:
     """What a fit left out, in words for the last line of its output; "" if that is nothing."""
     parts = []
-    harmonics = needs.get("sh_degree")
-    gaussians = needs.get("gaussians")
+    harmonics = decisions.get("sh_degree")
+    gaussians = decisions.get("gaussians")
     if harmonics and harmonics["chosen"] == 0:
         why = harmonics.get("why", "by rule")
         if harmonics["by"] == "photos":
             why = f"they can gain {harmonics['gain']:+.2f} dB"
         parts.append(f"harmonics ({why})")
-    overlap = needs.get("overlap")
+    overlap = decisions.get("overlap")
     if overlap and overlap.get("drop") == 0:
         parts.append(f"dropping (two places are shown together by {overlap['photos_per_pair']:.1f} photos)")
     if gaussians and gaussians["kept"] < gaussians["fitted"]:

@@ -306,7 +306,7 @@ PLAIN: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "seconds": ("a number, not negative", lambda v: is_number(v, 0)),
     "curve": ("a list of measurements", lambda v: _is_list(v, _is_point)),
     "notes": ("a list of texts", lambda v: _is_list(v, lambda x: isinstance(x, str))),
-    "needs": ("what was decided", lambda v: isinstance(v, dict)),
+    "decisions": ("what was decided", lambda v: isinstance(v, dict)),
     "extent": ("a number above 0", lambda v: is_number(v, 1e-300)),
     "near_plane": ("a number above 0", lambda v: is_number(v, 1e-300)),
     "depth": ("a number above 0", lambda v: is_number(v, 1e-300)),

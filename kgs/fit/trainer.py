@@ -90,7 +90,7 @@ class Trainer:
             self.load_state_dict(points)
         else:
             check_kind("points", points, InitialPoints)
-            exposed = with_exposure(scene, plan.needs)
+            exposed = with_exposure(scene, plan.decisions)
             self._use(TrainState.begin(exposed, plan, points), exposed)
 
     def _use(self, state: TrainState, scene: Scene) -> None:
@@ -147,7 +147,7 @@ class Trainer:
                 "seconds": round(state.seconds, 2),
                 "curve": state.curve,
                 "init": state.start.init,
-                "needs": self.plan.needs,
+                "decisions": self.plan.decisions,
                 "poses": None if state.poses is None else state.poses.moved(),
             },
             notes=tuple(state.notes),
@@ -212,7 +212,7 @@ class Trainer:
         return self.state.to_dict() | {
             "config": self.plan.config.to_dict(),
             "backend": self.plan.backend,
-            "needs": self.plan.needs,
+            "decisions": self.plan.decisions,
             "scene": self._fingerprint,
         }
 
@@ -232,9 +232,9 @@ class Trainer:
             longer = check_saved(values, self._fingerprint, plan.config, plan.times.steps)
             runs = next(x for x in BACKENDS if x.name == values["backend"]).runs_on(plan.device)
             backend = resolve(values["backend"] if runs else "auto", plan.device)
-            exposed = with_exposure(self._given, values["needs"])
+            exposed = with_exposure(self._given, values["decisions"])
         state = TrainState.from_dict(self._given, plan, values)
-        self.plan = replace(plan, backend=backend, needs=values["needs"])
+        self.plan = replace(plan, backend=backend, decisions=values["decisions"])
         state.notes += longer
         self._use(state, exposed)
 
@@ -272,7 +272,7 @@ class Trainer:
         values, damage = newest_checkpoint(Path(path))
         try:
             saved = values["config"]
-            names = ["sh_degree", "drop", *(["steps"] if "steps" in values["needs"].get("overlap", {}) else [])]
+            names = ["sh_degree", "drop", *(["steps"] if "steps" in values["decisions"].get("overlap", {}) else [])]
             decided = {name: saved[name] for name in names if getattr(config, name) is None}
             decay = config.recipe.opacity_decay
             if decay is None:  # more steps may have another

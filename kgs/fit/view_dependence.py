@@ -39,7 +39,7 @@ def decide_degree(plan: Plan, points: InitialPoints) -> Plan:
         points: its initial points; without patches of at least four views the degree is 0.
 
     Returns:
-        The plan with a degree. Its `needs` have under "sh_degree" a dict: "chosen"; "by", "rule" or "photos"; for a
+        The plan with a degree. Its `decisions` have under "sh_degree" a dict: "chosen"; "by", "rule" or "photos"; for a
         rule "why"; for photos "over" (the other degree), "gain" (how many dB harmonics can add to a fit of 25 dB) and
         "n" (the number of patches).
     """

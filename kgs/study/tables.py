@@ -147,8 +147,8 @@ def _compared(cells: pd.DataFrame, methods: Iterable[str], mean: str = "", bases
 
 
 def _degrees(frame: pd.DataFrame) -> Lines:
-    decided = frame[frame["needs.sh_degree.chosen"].notna()].sort_values("seed", kind="stable")
-    decided = decided.rename(columns=lambda name: name.removeprefix("needs.sh_degree."))
+    decided = frame[frame["decisions.sh_degree.chosen"].notna()].sort_values("seed", kind="stable")
+    decided = decided.rename(columns=lambda name: name.removeprefix("decisions.sh_degree."))
     heads = {
         "chosen": ("chosen", "{:.0f}"),
         "possible gain of degree 3 [dB]": ("gain", "{:+.2f}"),

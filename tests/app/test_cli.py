@@ -60,7 +60,7 @@ def test_a_fit_of_fewer_pixels_than_the_photos_have_names_detail_high(folder, tm
 def test_metrics_have_the_agreed_keys_and_say_what_the_splat_and_config_do(fitted):
     metrics = json.loads((fitted / "metrics.json").read_text())
     assert set(metrics) == {
-        "test", "train", "curve", "seconds", "peak_rss_mb", "gaussians", "needs", "steps", "seed", "drop", "init",
+        "test", "train", "curve", "seconds", "peak_rss_mb", "gaussians", "decisions", "steps", "seed", "drop", "init",
         "backend", "protocol", "versions", "seen", "poses",
     }  # fmt: skip
     assert set(metrics["test"]) == {"psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled", "views"}

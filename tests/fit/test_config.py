@@ -120,7 +120,7 @@ def test_a_plan_has_what_the_configuration_leaves_open_but_for_the_degree():
     assert plan.config == with_pace(FitConfig(seed=3), 2)
     assert plan.config.sh_degree is None
     assert plan.times == timetable(plan.config)
-    assert (plan.device, plan.needs) == (torch.device("cpu"), {})
+    assert (plan.device, plan.decisions) == (torch.device("cpu"), {})
     assert plan.backend in ("numba", "torch")
 
 
@@ -128,8 +128,8 @@ def test_a_degree_changes_the_timetable_and_says_why():
     first = make_plan(SCENE, FitConfig(steps=100))
     plan = first.decided({"sh_degree": 2}, {"sh_degree": {"by": "rule"}})
     assert (plan.config.sh_degree, len(plan.times.sh)) == (2, 2)
-    assert plan.needs == {"sh_degree": {"by": "rule"}}
-    assert (first.config.sh_degree, first.times.sh, first.needs) == (None, (), {})
+    assert plan.decisions == {"sh_degree": {"by": "rule"}}
+    assert (first.config.sh_degree, first.times.sh, first.decisions) == (None, (), {})
 
 
 def test_more_gaussians_or_pixels_take_more_memory():

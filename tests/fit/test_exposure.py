@@ -75,9 +75,9 @@ def test_gains_are_used_only_where_photos_differ(tiny_plan):
     warm = torch.ones(4, 3)
     warm[0, 0] = 1.1 * LEAST_RATIO
     each = replace(tiny_plan, config=replace(tiny_plan.config, exposure="each"))
-    assert "exposure" in decide_exposure(each, points_with(patches(equal))).needs
-    needs = decide_exposure(tiny_plan, points_with(patches(warm))).needs["exposure"]
-    torch.testing.assert_close(torch.tensor(needs["gains"]), centred(warm), rtol=5e-3, atol=0.0)
+    assert "exposure" in decide_exposure(each, points_with(patches(equal))).decisions
+    decisions = decide_exposure(tiny_plan, points_with(patches(warm))).decisions["exposure"]
+    torch.testing.assert_close(torch.tensor(decisions["gains"]), centred(warm), rtol=5e-3, atol=0.0)
 
 
 # -- of a scene -----------------------------------------------------------------------------------------------------
@@ -117,7 +117,7 @@ def test_training_views_are_compared_as_they_were_exposed_and_both_measures_are_
     metrics = measure(fit)
     assert metrics["train"]["psnr"] > metrics["test"]["psnr"]
     assert metrics["recolored"]["psnr"] > metrics["test"]["psnr"] + 1.0
-    assert metrics["needs"]["exposure"]["n"] >= MIN_PATCHES
+    assert metrics["decisions"]["exposure"]["n"] >= MIN_PATCHES
 
 
 def test_a_fit_without_its_history_cannot_be_measured(fit):
@@ -128,7 +128,7 @@ def test_a_fit_without_its_history_cannot_be_measured(fit):
 def test_the_presets_of_the_paper_have_none(exposed):
     for name in ("paper", "plain"):
         config = PRESETS[name]
-        assert "exposure" not in decide(make_plan(exposed, config), choose_points(exposed, config)).needs
+        assert "exposure" not in decide(make_plan(exposed, config), choose_points(exposed, config)).decisions
 
 
 def test_resumed_is_bit_identical(exposed, tmp_path):
@@ -199,7 +199,7 @@ def see_through(request):
     gains = GAIN.repeat(len(train), 1)
     scene = replace(scene, train=replace(train, gains=gains), test=test, background=behind)
     config = FitConfig(steps=1, evaluations=1)
-    history = {"needs": {}, "init": {"kind": "dense", "points": 60}, "poses": None}
+    history = {"decisions": {}, "init": {"kind": "dense", "points": 60}, "poses": None}
     return Fit(scene, model, RasterOptions(), settings=config, history=history)
 
 
@@ -219,9 +219,9 @@ def test_a_background_that_shows_through_is_not_exposed_in_the_curve_and_in_pict
     scene = see_through.scene
     bare = replace(scene, train=replace(scene.train, gains=None))
     plan = make_plan(bare, see_through.settings)
-    needs = {"exposure": {"gains": scene.train.gains.tolist()}}
+    decisions = {"exposure": {"gains": scene.train.gains.tolist()}}
     points = InitialPoints(see_through.model.means.detach(), torch.full((60, 3), 0.5), "dense")
-    trainer = Trainer(bare, replace(plan, needs=needs), points)
+    trainer = Trainer(bare, replace(plan, decisions=decisions), points)
     trainer.state.model.load_state_dict(see_through.model.state_dict())
     trainer._measure_curve()
     assert comparable(trainer.state.curve[0]["train_psnr"]) > 80

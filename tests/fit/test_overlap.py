@@ -72,8 +72,8 @@ def test_what_is_open_is_decided_by_the_patches(scene, photos):
     assert plan.times.steps == chosen["steps"]
     numbers = {"photos_per_place": pytest.approx(photos), "photos_per_pair": pytest.approx(together, abs=0.01)}
     found = {"overlap": {**numbers, "patches": 1000, **chosen}}
-    assert json.loads(json.dumps(plan.needs)) == found
-    assert ("dropping" in left_out(plan.needs)) == (chosen["drop"] == 0)
+    assert json.loads(json.dumps(plan.decisions)) == found
+    assert ("dropping" in left_out(plan.decisions)) == (chosen["drop"] == 0)
     assert (Trainer(scene, plan, points_seen_by(photos)).state.drop is None) == (chosen["drop"] == 0)
 
 
@@ -82,14 +82,14 @@ def test_what_is_open_is_decided_by_the_patches(scene, photos):
 )
 def test_without_patches_gaussians_are_dropped_in_a_fit_of_the_usual_length(scene, points):
     plan = decide_by_overlap(make_plan(scene, OPEN), points)
-    assert (plan.config.drop, plan.config.steps, plan.needs) == (DROP, MANY.steps, {})
+    assert (plan.config.drop, plan.config.steps, plan.decisions) == (DROP, MANY.steps, {})
 
 
 @pytest.mark.parametrize("given", [{"drop": 0.0}, {"drop": 0.2}, {"steps": 7}, {"steps": 7, "drop": 0.2}])
 def test_what_is_given_is_not_decided(scene, given):
     plan = decide_by_overlap(make_plan(scene, replace(OPEN, **given)), points_seen_by(8.0))
     assert {name: getattr(plan.config, name) for name in given} == given
-    assert not given.keys() & plan.needs.get("overlap", {}).keys()
+    assert not given.keys() & plan.decisions.get("overlap", {}).keys()
 
 
 def test_a_trainer_whose_plan_is_open_drops_in_a_fit_of_the_usual_length(scene, tmp_path):
@@ -107,7 +107,7 @@ def test_a_fit_goes_on_as_it_was_decided(scene, tmp_path):
     trainer.save(tmp_path / "c.safetensors")
     resumed = Trainer.resume(scene, OPEN, tmp_path / "c.safetensors")
     assert resumed.state.drop is None
-    assert resumed.plan.needs == plan.needs
+    assert resumed.plan.decisions == plan.decisions
     assert (resumed.plan.config.drop, resumed.plan.times.steps) == (0, steps_for(8.0))
 
 
@@ -115,7 +115,7 @@ def test_a_whole_fit_says_what_it_decided():
     """Eight photos of the room, all of which show most places."""
     large = synthetic_scene("room", train_views=8, test_views=1, size=(96, 128))
     fit = fit_scene(large, FitConfig(steps=4, evaluations=1))
-    found = fit.history["needs"]["overlap"]
+    found = fit.history["decisions"]["overlap"]
     assert 3 <= found["photos_per_pair"] <= found["photos_per_place"] <= 8
     assert found["drop"] == fit.settings.drop == pytest.approx(drop_rate_for(found["photos_per_pair"]), abs=0.01)
     assert "steps" not in found

@@ -19,7 +19,7 @@ from kgs.types import RasterOptions
 def as_fit(scene, model, **changes):
     """A fit whose Gaussians are these."""
     config = FitConfig(steps=5, sh_degree=model.max_sh_degree, **changes)
-    return Fit(scene, model, RasterOptions(near_plane=0.01), settings=config, history={"needs": {"other": 1}})
+    return Fit(scene, model, RasterOptions(near_plane=0.01), settings=config, history={"decisions": {"other": 1}})
 
 
 def in_front(scene, n, sh_degree=0):
@@ -53,7 +53,7 @@ def test_contributions_are_sums_of_blending_weights(each_backend, scene):
 def test_what_no_view_shows_is_left_out_and_the_pictures_stay(each_backend, scene):
     fit = as_fit(scene, in_front(scene, 40))
     pruned = prune(fit)
-    found = pruned.history["needs"]["gaussians"]
+    found = pruned.history["decisions"]["gaussians"]
     assert found["fitted"] == 40 == len(fit.model)
     assert found["kept"] == len(pruned.model) < 40
     assert not bool((pruned.model.means == fit.model.means[-1]).all(1).any())
@@ -67,8 +67,8 @@ def test_what_no_view_shows_is_left_out_and_the_pictures_stay(each_backend, scen
 def test_pruning_changes_no_other_fit_and_can_be_repeated_from_its_part(scene):
     fit = as_fit(scene, in_front(scene, 40))
     pruned = prune(fit)
-    assert (len(fit.model), fit.part, fit.history["needs"]) == (40, {}, {"other": 1})
-    assert pruned.history["needs"]["other"] == 1
+    assert (len(fit.model), fit.part, fit.history["decisions"]) == (40, {}, {"other": 1})
+    assert pruned.history["decisions"]["other"] == 1
     assert torch.equal(fit.model.select(**pruned.part).means, pruned.model.means)
 
 
@@ -85,7 +85,7 @@ def test_harmonics_that_no_picture_shows_are_left_out(scene, size, degree):
         model.sh_rest[:, 8:] = 0.0
     fit = as_fit(scene, model)
     pruned = prune(fit)
-    assert pruned.model.max_sh_degree == pruned.history["needs"]["gaussians"]["sh_degree"] == degree
+    assert pruned.model.max_sh_degree == pruned.history["decisions"]["gaussians"]["sh_degree"] == degree
     camera = scene.train.camera(0)
     assert float((pruned.render(camera) - fit.render(camera)).abs().max()) <= QUANTUM + 0.02
 

@@ -225,7 +225,7 @@ def test_the_default_stands_beside_the_others():
     decided = {"chosen": 3, "by": "photos", "over": 0, "gain": 0.4, "n": 2000}
     for row in rows:
         if row["cell"]["method"] == "auto":
-            row["result"]["needs"] = {"sh_degree": decided if row["cell"]["seed"] else {"chosen": 0, "by": "rule"}}
+            row["result"]["decisions"] = {"sh_degree": decided if row["cell"]["seed"] else {"chosen": 0, "by": "rule"}}
     tables = sparse_tables(cells_frame(rows))
     main = next(table for title, table in tables.items() if title.startswith("Test views"))
     methods = {scene: [*lines.method] for scene, lines in main.groupby("scene")}

@@ -169,7 +169,7 @@ def fit(
     shrink = request.shrink(base, loaded)
     shrunk = ("--downscale", f"{shrink:g}") if shrink > 1.0 else ()
     say(f"{printable(splat)}: {metrics['gaussians']} Gaussians after {metrics['steps']} steps")
-    if needless := left_out(metrics["needs"]):
+    if needless := left_out(metrics["decisions"]):
         say(f"left out: {needless}")
     if published.signal:
         say_next("the same command with --resume goes on where it stopped")

@@ -110,7 +110,7 @@ def write_fit_page(
             remarks=[*_remarks(runs), *remarks],
             settings=_settings(settings or {}, fit.metrics),
             report=_report_facts(_read_report(report)),
-            left_out=left_out(first_run.get("needs") or {}),
+            left_out=left_out(first_run.get("decisions") or {}),
         ),
     )
     return write_page(path, content)
