@@ -138,7 +138,7 @@ def fit_folder(
                 discard_fit(work, say)
             raise
         folder = out
-        is_done = trainer.step >= trainer.plan.times.steps
+        is_done = trainer.step >= trainer.plan.schedule.steps
         if not is_done and (is_finished(out) or step_of(out) > trainer.step):
             folder = work
             kept = f"{printable(out)} keeps its {_state(out)}; this one is in {printable(work)}"
@@ -260,7 +260,7 @@ def _settings(trainer: Trainer, request: SceneRequest) -> dict[str, Any]:
     return {
         "request": request.to_dict(),
         "fit": trainer.plan.config.to_dict(),
-        "timetable": trainer.plan.times._asdict(),
+        "schedule": trainer.plan.schedule._asdict(),
         "max_gaussians": trainer.state.densifier.max_gaussians,
         "near_plane": trainer.state.start.near_plane,
         "extent": trainer.state.start.extent,
@@ -297,7 +297,7 @@ def train(
     """
     saved = time.monotonic()
     has_failed = False
-    times = trainer.plan.times
+    schedule = trainer.plan.schedule
 
     def save(part: dict[str, Any] | None = None) -> None:
         nonlocal saved, has_failed
@@ -310,11 +310,11 @@ def train(
                     trainer.state.note(f"step {trainer.step}: no checkpoint: {error}")
                 has_failed = True
 
-    with _interruptible() as stopped, progress(times.steps, title, trainer.step) as advance:
+    with _interruptible() as stopped, progress(schedule.steps, title, trainer.step) as advance:
 
         def after_step(trainer: Trainer, loss: float) -> bool:
             advance(f"loss={loss:.4f}, {len(trainer.model)} Gaussians")
-            if trainer.step in times.evaluate or time.monotonic() - saved > _SAVE_SECONDS:
+            if trainer.step in schedule.evaluate or time.monotonic() - saved > _SAVE_SECONDS:
                 save()
             if live is not None:
                 live.after_step(trainer)

@@ -46,7 +46,7 @@ class LivePage:
     def __init__(self, trainer: Trainer, title: str, roll: float) -> None:
         gaussians = _copied(trainer.model)
         some = gaussians[:: max(1, len(gaussians) // _SOME)]
-        self._steps = trainer.plan.times.steps
+        self._steps = trainer.plan.schedule.steps
         self._begin = _clocks()
         self._shown = float("-inf")  # time of the last splat
         self._seconds = 0.0  # processor time that copies took

@@ -8,7 +8,7 @@ Examples:
     >>> scene = synthetic_scene(train_views=2, size=(16, 16))
     >>> plan = make_plan(scene, FitConfig(steps=2))
     >>> trainer = Trainer(scene, plan, initial_points(scene.train, "random", count=50))
-    >>> while trainer.step < plan.times.steps:
+    >>> while trainer.step < plan.schedule.steps:
     ...     loss = trainer.train_step()
     >>> fit = trainer.result()
 """

@@ -107,7 +107,7 @@ def with_exposure(scene: Scene, decisions: dict[str, Any]) -> Scene:
     Raises:
         ValueError: they are not three numbers above 0 for each view.
     """
-    if "exposure" not in needs:
+    if "exposure" not in decisions:
         return scene
     views = scene.train
     gains = torch.tensor(decisions["exposure"]["gains"], dtype=torch.float32)

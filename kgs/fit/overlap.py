@@ -55,7 +55,7 @@ def decide_by_overlap(plan: Plan, points: InitialPoints) -> Plan:
         return plan
     patches = points.patches
     if patches is None or len(patches) < MIN_PATCHES:
-        usual = {"steps": plan.times.steps, "drop": DROP}
+        usual = {"steps": plan.schedule.steps, "drop": DROP}
         return plan.decided({name: usual[name] for name in is_open}, {})
     overlap = Overlap.of(patches)
     chosen = {"steps": steps_for(overlap.photos_per_place), "drop": drop_rate_for(overlap.photos_per_pair)}

@@ -15,7 +15,7 @@ from kgs.types import check_kind
 from .config import FitConfig
 
 
-class Timetable(NamedTuple):
+class Schedule(NamedTuple):
     """The steps at which things happen in a fit of a given length."""
 
     steps: int  # all of them
@@ -49,20 +49,20 @@ class Plan:
             `drop` of None as 0.3, a `steps` of None as 1100; :func:`kgs.fit.run.decide` replaces them.
         device: of the fit.
         backend: "numba", "triton" or "torch".
-        times: the steps at which things happen.
+        schedule: the steps at which things happen.
         decisions: what was decided about the scene, and why, for metrics.json.
     """
 
     config: FitConfig
     device: torch.device
     backend: str
-    times: Timetable
+    schedule: Schedule
     decisions: dict[str, Any] = field(default_factory=dict)
 
     def decided(self, entries: dict[str, Any], decisions: dict[str, Any]) -> Self:
         """The plan with these entries of its configuration; why they were decided goes into `decisions`."""
         config = replace(self.config, **entries)
-        return replace(self, config=config, times=timetable(config), decisions={**self.decisions, **decisions})
+        return replace(self, config=config, schedule=make_schedule(config), decisions={**self.decisions, **decisions})
 
 
 def make_plan(scene: Scene, config: FitConfig) -> Plan:
@@ -82,7 +82,7 @@ def make_plan(scene: Scene, config: FitConfig) -> Plan:
     device = check_device(config.device)
     backend = resolve(config.backend, device)
     config = with_pace(config, len(scene.train))
-    return Plan(config, device, backend, timetable(config))
+    return Plan(config, device, backend, make_schedule(config))
 
 
 def with_pace(config: FitConfig, views: int) -> FitConfig:
@@ -99,7 +99,7 @@ def with_pace(config: FitConfig, views: int) -> FitConfig:
     return replace(config, steps=steps, coarse=config.coarse or 0.0, recipe=recipe)
 
 
-def timetable(config: FitConfig) -> Timetable:
+def make_schedule(config: FitConfig) -> Schedule:
     """Scale the recipe's counts by steps / `recipe.steps`.
 
     A short fit shortens the densification interval only as far as it needs to densify about 20 times, and never below
@@ -115,7 +115,7 @@ def timetable(config: FitConfig) -> Timetable:
     resets = [*range(spacing, steps, spacing), steps]
     looks = max(50, round(recipe.haze_interval * scale)) if recipe.haze_interval else steps
     evaluations = range(1, config.evaluations + 1)
-    return Timetable(
+    return Schedule(
         steps=steps,
         sh=tuple(max(1, round(recipe.sh_interval * scale * k)) for k in range(1, (config.sh_degree or 0) + 1)),
         densify=tuple(s for s in range(interval, steps, interval) if s > round(recipe.densify_from * scale)),

@@ -50,7 +50,7 @@ def prune(fit: Fit) -> Fit:
         "sh_degree": pruned.part["sh_degree"],
     }
     decisions = {**fit.history["decisions"], "gaussians": record}
-    return replace(pruned, history={**fit.history, "decisions": needs})
+    return replace(pruned, history={**fit.history, "decisions": decisions})
 
 
 def _part(fit: Fit, rows: Tensor, sh_degree: int) -> Fit:

@@ -125,7 +125,7 @@ class TrainState:
         )
         poses = None
         if config.refine_poses:
-            poses = MovingPoses(scene.train.cameras.extrinsics, plan.times.steps, start.depth)
+            poses = MovingPoses(scene.train.cameras.extrinsics, plan.schedule.steps, start.depth)
         return cls(
             start,
             model,

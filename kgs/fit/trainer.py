@@ -107,7 +107,7 @@ class Trainer:
         self.scene = scene if state.poses is None else place_cameras(scene, state.poses.extrinsics)
         self._views = targets(scene.train, scene.background, self.plan.device)
         self._halved = (
-            targets(scene.train.halved(), scene.background, self.plan.device) if self.plan.times.coarse else []
+            targets(scene.train.halved(), scene.background, self.plan.device) if self.plan.schedule.coarse else []
         )
 
     @property
@@ -127,7 +127,7 @@ class Trainer:
             TrainingDiverged: something is not finite, and that step has changed no parameter; or a scale explodes. On a
                 GPU it may be up to 20 steps late, when parameters are damaged; no checkpoint has them.
         """
-        while self.step < self.plan.times.steps:
+        while self.step < self.plan.schedule.steps:
             loss = self.train_step()
             if callback is not None and callback(self, loss):
                 break
@@ -166,23 +166,23 @@ class Trainer:
         if torch.is_inference_mode_enabled():
             raise RuntimeError("train_step: expected no torch.inference_mode, in which there are no gradients")
         state = self.state
-        times = self.plan.times
-        if state.step >= times.steps:
-            raise ValueError(f"steps: expected a step of {times.steps} to be left, got none")
+        schedule = self.plan.schedule
+        if state.step >= schedule.steps:
+            raise ValueError(f"steps: expected a step of {schedule.steps} to be left, got none")
         start = time.perf_counter()
         with threads_beside(self.plan.backend), torch.enable_grad():
             loss = self._descend()
         state.seconds += time.perf_counter() - start
-        if state.step in times.evaluate:  # before densifying: right after it the image is 2 dB worse for a while
+        if state.step in schedule.evaluate:  # before densifying: right after it the image is 2 dB worse for a while
             self._measure_curve()
         start = time.perf_counter()
-        if state.step in times.haze:
+        if state.step in schedule.haze:
             with threads_beside(self.plan.backend):
                 state.densifier.decay_opacity(FADE, veils(self.result()))
-        if state.step in times.densify:
+        if state.step in schedule.densify:
             with threads_beside(self.plan.backend):
                 self._densify()
-        if state.step in times.reset:
+        if state.step in schedule.reset:
             state.densifier.reset_opacity(self.plan.config.recipe.reset_opacity)
         if state.step % _LOOK == 0:
             bound_scales(state.model, state.start.extent)
@@ -229,7 +229,7 @@ class Trainer:
         """
         plan = self.plan
         with state_errors():
-            longer = check_saved(values, self._fingerprint, plan.config, plan.times.steps)
+            longer = check_saved(values, self._fingerprint, plan.config, plan.schedule.steps)
             runs = next(x for x in BACKENDS if x.name == values["backend"]).runs_on(plan.device)
             backend = resolve(values["backend"] if runs else "auto", plan.device)
             exposed = with_exposure(self._given, values["decisions"])
@@ -295,12 +295,12 @@ class Trainer:
         """Render a training view, compare it with its photo, and move the parameters; returns the loss."""
         state = self.state
         config = self.plan.config
-        steps = self.plan.times.steps
+        steps = self.plan.schedule.steps
         state.step += 1
         progress = state.step / steps
         self._set_progress(progress)
         index = self._next_view()
-        view = (self._halved if state.step <= self.plan.times.coarse else self._views)[index]
+        view = (self._halved if state.step <= self.plan.schedule.coarse else self._views)[index]
         camera = view.camera if state.poses is None else state.poses.camera(view.camera, index)
         background = self._background
         if config.training_background == "random":
@@ -336,11 +336,11 @@ class Trainer:
             self.renderer.options = replace(self.renderer.options, alpha_threshold=threshold)
         rate = decayed(recipe.lr_means, recipe.lr_means_final, progress)
         state.optimizer.param_groups[0]["lr"] = state.start.extent * rate
-        degree = sum(state.step >= step for step in self.plan.times.sh)
+        degree = sum(state.step >= step for step in self.plan.schedule.sh)
         state.model.sh_degree = max(state.model.sh_degree, degree)  # a finished fit that goes on keeps its degree
         if state.drop is not None:
             state.drop.progress = progress
-            state.drop.train(state.step <= self.plan.times.drop)
+            state.drop.train(state.step <= self.plan.schedule.drop)
 
     def _move(self, progress: float) -> None:
         """Change the parameters by their gradients."""

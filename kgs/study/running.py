@@ -39,7 +39,7 @@ def tell_steps() -> "Callable[[Trainer, float], bool] | None":
         if now - last >= SECONDS:
             last = now
             with suppress(RuntimeError):  # the worker is closing
-                worker.log_event(TOPIC, {"key": key, "step": trainer.step, "steps": trainer.plan.times.steps})
+                worker.log_event(TOPIC, {"key": key, "step": trainer.step, "steps": trainer.plan.schedule.steps})
         return False
 
     return tell

@@ -74,7 +74,7 @@ def test_metrics_have_the_agreed_keys_and_say_what_the_splat_and_config_do(fitte
     assert model.max_sh_degree == 0  # three training views
     config = json.loads((fitted / "config.json").read_text())
     assert config["fit"]["steps"] == STEPS
-    assert config["timetable"]["densify"] == [10, 20]
+    assert config["schedule"]["densify"] == [10, 20]
 
 
 def test_render_gives_the_pictures_of_fit(fitted, folder, tmp_path):

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from kgs.fit.config import FitConfig, Recipe
-from kgs.fit.plan import timetable
+from kgs.fit.plan import make_schedule
 
 __all__ = ["PATIENCE", "Fit", "memory_of", "start_command"]
 
@@ -28,8 +28,8 @@ def _config(steps: int, points: Path, **changes: Any) -> FitConfig:
     """Densification, resets, harmonics and dropping all happen; a checkpoint is written every third step."""
     recipe = Recipe(grad_threshold=1e-5, prune_opacity=0.005, reset_interval=3000, reset_recovery=5)
     config = FitConfig(steps=steps, drop=0.3, evaluations=steps // 3, max_gaussians=1500, sh_degree=3, recipe=recipe)
-    times = timetable(config)
-    if not (times.densify and times.reset and len(times.sh) == 3):
+    schedule = make_schedule(config)
+    if not (schedule.densify and schedule.reset and len(schedule.sh) == 3):
         raise RuntimeError(f"steps: expected room for all that a fit can do, got {steps}: {times}")
     return replace(config, init="file", init_file=points, **changes)
 
@@ -92,7 +92,7 @@ def _fit(fit: Fit, limit: int | None) -> None:
         fit.started.touch()
         if limit is not None and trainer.step >= fit.steps // 5:
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
-        if trainer.step == trainer.plan.times.steps:
+        if trainer.step == trainer.plan.schedule.steps:
             measure(trainer)
 
     Trainer._measure_curve = measure_curve  # type: ignore[method-assign]

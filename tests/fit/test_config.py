@@ -13,7 +13,7 @@ import torch
 from kgs import RasterOptions
 from kgs.datasets import synthetic_scene
 from kgs.fit.config import PAPER, PRESETS, FitConfig, Recipe
-from kgs.fit.plan import expected_memory, make_plan, most_gaussians, timetable, with_pace
+from kgs.fit.plan import expected_memory, make_plan, most_gaussians, make_schedule, with_pace
 
 
 @pytest.mark.parametrize(
@@ -24,27 +24,27 @@ from kgs.fit.plan import expected_memory, make_plan, most_gaussians, timetable, 
     ],
 )
 def test_a_short_fit_scales_the_counts_of_the_release(steps, sh, densify, reset):
-    times = timetable(replace(PAPER, steps=steps))
-    assert (times.sh, times.densify, times.reset) == (sh, tuple(densify), reset)
-    assert times.evaluate[-1] == steps
+    schedule = make_schedule(replace(PAPER, steps=steps))
+    assert (schedule.sh, schedule.densify, schedule.reset) == (sh, tuple(densify), reset)
+    assert schedule.evaluate[-1] == steps
 
 
 @pytest.mark.parametrize("steps", [1, 7, 100, 999])
 def test_densification_is_never_closer_than_ten_steps(steps):
-    densify = timetable(FitConfig(steps=steps)).densify
+    densify = make_schedule(FitConfig(steps=steps)).densify
     assert all(later - step >= 10 for step, later in pairwise(densify))
 
 
 @pytest.mark.parametrize("steps", [500, 2000, 4000, 10_000, 30_000])
 def test_a_reset_leaves_time_to_recover(steps):
-    times = timetable(replace(PAPER, steps=steps))
-    assert all(end - step >= 200 for step, end in pairwise([*times.reset, steps]))
+    schedule = make_schedule(replace(PAPER, steps=steps))
+    assert all(end - step >= 200 for step, end in pairwise([*schedule.reset, steps]))
 
 
 def test_the_default_leaves_out_resets_and_harmonics():
-    times = timetable(PRESETS["auto"])
-    assert (times.sh, times.reset) == ((), ())
-    assert times.densify == timetable(replace(PAPER, steps=times.steps)).densify
+    schedule = make_schedule(PRESETS["auto"])
+    assert (schedule.sh, schedule.reset) == ((), ())
+    assert schedule.densify == make_schedule(replace(PAPER, steps=schedule.steps)).densify
 
 
 @pytest.mark.parametrize(("views", "steps"), [(1, 900), (3, 900), (4, None), (12, None)])
@@ -104,9 +104,9 @@ def test_numpys_numbers_and_paths_as_text_become_pythons():
 
 
 def test_the_coarse_share_is_counted_in_steps():
-    assert timetable(FitConfig(steps=2000)).coarse == 0
+    assert make_schedule(FitConfig(steps=2000)).coarse == 0
     assert with_pace(FitConfig(), 6).coarse == 0
-    assert timetable(FitConfig(steps=1000, coarse=0.5)).coarse == 500
+    assert make_schedule(FitConfig(steps=1000, coarse=0.5)).coarse == 500
 
 
 # -- the plan ------------------------------------------------------------------------------------------------------
@@ -119,7 +119,7 @@ def test_a_plan_has_what_the_configuration_leaves_open_but_for_the_degree():
     plan = make_plan(SCENE, FitConfig(seed=3))
     assert plan.config == with_pace(FitConfig(seed=3), 2)
     assert plan.config.sh_degree is None
-    assert plan.times == timetable(plan.config)
+    assert plan.schedule == make_schedule(plan.config)
     assert (plan.device, plan.decisions) == (torch.device("cpu"), {})
     assert plan.backend in ("numba", "torch")
 
@@ -127,9 +127,9 @@ def test_a_plan_has_what_the_configuration_leaves_open_but_for_the_degree():
 def test_a_degree_changes_the_timetable_and_says_why():
     first = make_plan(SCENE, FitConfig(steps=100))
     plan = first.decided({"sh_degree": 2}, {"sh_degree": {"by": "rule"}})
-    assert (plan.config.sh_degree, len(plan.times.sh)) == (2, 2)
+    assert (plan.config.sh_degree, len(plan.schedule.sh)) == (2, 2)
     assert plan.decisions == {"sh_degree": {"by": "rule"}}
-    assert (first.config.sh_degree, first.times.sh, first.decisions) == (None, (), {})
+    assert (first.config.sh_degree, first.schedule.sh, first.decisions) == (None, (), {})
 
 
 def test_more_gaussians_or_pixels_take_more_memory():

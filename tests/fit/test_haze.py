@@ -11,7 +11,7 @@ from kgs.datasets import synthetic_scene
 from kgs.fit import Fit, FitConfig
 from kgs.fit.config import PAPER, Recipe
 from kgs.fit.haze import FADE, WINDOW, darkest, veils
-from kgs.fit.plan import make_plan, timetable
+from kgs.fit.plan import make_plan, make_schedule
 from kgs.fit.run import choose_points
 from kgs.fit.trainer import Trainer
 from kgs.types import RasterOptions
@@ -101,10 +101,10 @@ def test_a_fit_fades_veils_and_the_papers_recipe_does_not(monkeypatch):
     config = FitConfig(steps=170, init="random", init_points=50, evaluations=1, recipe=Recipe(opacity_decay=1.0))
     Trainer(scene, make_plan(scene, config), choose_points(scene, config)).fit()
     assert faded == [(FADE, False)] * 3  # after 50, 100 and 150 steps
-    assert timetable(PAPER).haze == ()
+    assert make_schedule(PAPER).haze == ()
 
 
 def test_looks_for_haze_end_before_the_fit():
-    assert timetable(FitConfig(steps=900)).haze == tuple(range(90, 811, 90))
-    assert timetable(FitConfig(steps=49)).haze == ()
-    assert timetable(FitConfig(steps=900, recipe=Recipe(haze_interval=0))).haze == ()
+    assert make_schedule(FitConfig(steps=900)).haze == tuple(range(90, 811, 90))
+    assert make_schedule(FitConfig(steps=49)).haze == ()
+    assert make_schedule(FitConfig(steps=900, recipe=Recipe(haze_interval=0))).haze == ()

@@ -69,7 +69,7 @@ def test_what_is_open_is_decided_by_the_patches(scene, photos):
     together = Overlap.of(points_seen_by(photos).patches).photos_per_pair
     chosen = {"steps": steps_for(photos), "drop": drop_rate_for(together)}
     assert plan.config == replace(make_plan(scene, OPEN).config, **chosen)
-    assert plan.times.steps == chosen["steps"]
+    assert plan.schedule.steps == chosen["steps"]
     numbers = {"photos_per_place": pytest.approx(photos), "photos_per_pair": pytest.approx(together, abs=0.01)}
     found = {"overlap": {**numbers, "patches": 1000, **chosen}}
     assert json.loads(json.dumps(plan.decisions)) == found
@@ -95,9 +95,9 @@ def test_what_is_given_is_not_decided(scene, given):
 def test_a_trainer_whose_plan_is_open_drops_in_a_fit_of_the_usual_length(scene, tmp_path):
     trainer = Trainer(scene, make_plan(scene, OPEN), points_seen_by(3.0))
     assert isinstance(trainer.state.drop, DropGaussian)
-    assert (trainer.state.drop.p, trainer.plan.times.steps) == (DROP, MANY.steps)
+    assert (trainer.state.drop.p, trainer.plan.schedule.steps) == (DROP, MANY.steps)
     trainer.save(tmp_path / "c.safetensors")
-    assert Trainer.resume(scene, OPEN, tmp_path / "c.safetensors").plan.times.steps == MANY.steps
+    assert Trainer.resume(scene, OPEN, tmp_path / "c.safetensors").plan.schedule.steps == MANY.steps
 
 
 def test_a_fit_goes_on_as_it_was_decided(scene, tmp_path):
@@ -108,7 +108,7 @@ def test_a_fit_goes_on_as_it_was_decided(scene, tmp_path):
     resumed = Trainer.resume(scene, OPEN, tmp_path / "c.safetensors")
     assert resumed.state.drop is None
     assert resumed.plan.decisions == plan.decisions
-    assert (resumed.plan.config.drop, resumed.plan.times.steps) == (0, steps_for(8.0))
+    assert (resumed.plan.config.drop, resumed.plan.schedule.steps) == (0, steps_for(8.0))
 
 
 def test_a_whole_fit_says_what_it_decided():

@@ -96,7 +96,7 @@ def test_harmonics_come_one_degree_after_the_other(scene, points):
     degrees = []
     trainer.fit(lambda trainer, _: degrees.append(trainer.model.sh_degree))
     assert degrees == sorted(degrees)
-    assert [degrees.index(degree) + 1 for degree in (1, 2, 3)] == list(trainer.plan.times.sh)
+    assert [degrees.index(degree) + 1 for degree in (1, 2, 3)] == list(trainer.plan.schedule.sh)
 
 
 def test_another_seed_other_bits(each_backend, scene, points):
@@ -128,7 +128,7 @@ def test_with_and_without_drop_see_the_same_views(scene, points):
 )
 def test_resumed_is_bit_identical(whole, scene, points, tmp_path, at):
     if at == 10:
-        assert at in whole.plan.times.densify
+        assert at in whole.plan.schedule.densify
     first = begun(scene, points)
     first.fit(lambda trainer, _: trainer.step == at)
     assert first.step == at
@@ -229,7 +229,7 @@ def test_it_stops_at_a_gradient_whose_square_overflows(scene, points):
 
 def test_it_stops_where_scales_explode(scene, points):
     trainer = begun(scene, points)
-    trainer.fit(lambda trainer, _: trainer.step == min(trainer.plan.times.densify) - 1)
+    trainer.fit(lambda trainer, _: trainer.step == min(trainer.plan.schedule.densify) - 1)
     with torch.no_grad():
         trainer.model.log_scales[3, 1] = 40.0
     with pytest.raises(TrainingDiverged, match="scales below 1e[+]06 times the extent.*Gaussian 3"):

@@ -163,7 +163,7 @@ def test_harmonics_have_to_gain_enough(monkeypatch, scene, gain, degree):
     patches = made_up()
     plan = decide(make_plan(scene, OPEN), as_points(patches))
     assert plan.config.sh_degree == degree
-    assert plan.times == make_plan(scene, plan.config).times
+    assert plan.schedule == make_plan(scene, plan.config).times
     found = {"chosen": degree, "by": "photos", "over": 3 - degree, "gain": pytest.approx(gain), "n": len(patches)}
     assert json.loads(json.dumps(plan.decisions)) == {"sh_degree": found}
 

@@ -37,7 +37,7 @@ from kgs.app.saved_fit import read_settings
 from kgs.datasets import Scene, Views, load_scene, synthetic_scene
 from kgs.datasets.image_file import read_image
 from kgs.fit.config import FitConfig
-from kgs.fit.plan import make_plan, timetable
+from kgs.fit.plan import make_plan, make_schedule
 from kgs.fit.trainer import Trainer
 from kgs.init_points import InitialPoints
 from kgs.init_points.files import read_points
@@ -138,7 +138,7 @@ def _read_checkpoint(folder: Path) -> None:
 
 def _read_config(folder: Path) -> None:
     _, config = read_settings(folder / "config.json")
-    timetable(config)
+    make_schedule(config)
     json.dumps(config.to_dict(), allow_nan=False)
 
 

@@ -20,7 +20,7 @@ def count_to_four(cell):
     """Work that tells its steps, as a fit does."""
     tell = tell_steps()
     for step in (1, 2, 3, 4):
-        trainer = SimpleNamespace(step=step, plan=SimpleNamespace(times=SimpleNamespace(steps=4)))
+        trainer = SimpleNamespace(step=step, plan=SimpleNamespace(schedule=SimpleNamespace(steps=4)))
         assert tell(trainer, 0.5) is False  # the fit goes on
     return {"steps": step}
 

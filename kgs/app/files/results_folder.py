@@ -16,7 +16,7 @@ PREVIOUS = "checkpoint.previous.safetensors"
 def is_finished(out: Path) -> bool:
     """Whether the folder has the results of a fit that did all its steps."""
     try:
-        return bool(read_json(out / "metrics.json")["steps"] >= read_json(out / "config.json")["timetable"]["steps"])
+        return bool(read_json(out / "metrics.json")["steps"] >= read_json(out / "config.json")["schedule"]["steps"])
     except (DataError, KeyError, TypeError):
         return False
 

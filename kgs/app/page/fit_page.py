@@ -246,7 +246,7 @@ def _settings(config: Mapping[str, Any], metrics: Mapping[str, Any]) -> dict[str
 
     Where metrics.json says what was used in place of what was asked for, it is that.
     """
-    rest = {name: value for name, value in config.items() if name not in ("request", "fit", "timetable")}
+    rest = {name: value for name, value in config.items() if name not in ("request", "fit", "schedule")}
     values = {**config.get("request", {}), **config.get("fit", {}), **rest}
     with suppress(KeyError, TypeError):
         values["init"] = used_init(values["init"], metrics["init"]["kind"])
