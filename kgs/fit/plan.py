@@ -16,7 +16,7 @@ from .config import FitConfig
 
 
 class Schedule(NamedTuple):
-    """The steps at which things happen in a fit of a given length."""
+    """The steps at which a fit of a given length does what it does not do in each."""
 
     steps: int  # all of them
     sh: tuple[int, ...]  # before these one more degree of harmonics is switched on
@@ -28,16 +28,16 @@ class Schedule(NamedTuple):
     coarse: int  # up to this one the training views are seen at half their width
 
 
-class Pace(NamedTuple):
+class StepDefaults(NamedTuple):
     """The length of a fit, and how fast opacities fade: with more views, what only some show is seen less often."""
 
     steps: int
     opacity_decay: float
 
 
-FEW = Pace(900, 0.9925)  # of a fit to so few training views
-MANY = Pace(1100, 0.995)  # of a fit to more, where nothing tells how many of them show each place
-FADING_STEPS = 1000  # up to so many the pace of few views may be used: in longer fits too much would fade
+FEW = StepDefaults(900, 0.9925)  # of a fit to so few training views
+MANY = StepDefaults(1100, 0.995)  # of a fit to more, where nothing tells how many of them show each place
+FADING_STEPS = 1000  # up to so many the defaults of few views are used: in longer fits too much would fade
 
 
 @dataclass(frozen=True)
@@ -81,11 +81,11 @@ def make_plan(scene: Scene, config: FitConfig) -> Plan:
     check_kind("config", config, FitConfig)
     device = check_device(config.device)
     backend = resolve(config.backend, device)
-    config = with_pace(config, len(scene.train))
+    config = with_step_defaults(config, len(scene.train))
     return Plan(config, device, backend, make_schedule(config))
 
 
-def with_pace(config: FitConfig, views: int) -> FitConfig:
+def with_step_defaults(config: FitConfig, views: int) -> FitConfig:
     """The configuration with the numbers for so many training views, where it leaves them open.
 
     The number of steps stays open for more than three views: how many of them show each place decides.
@@ -94,8 +94,8 @@ def with_pace(config: FitConfig, views: int) -> FitConfig:
     steps = config.steps or (FEW.steps if few else None)
     recipe = config.recipe
     if recipe.opacity_decay is None:
-        pace = FEW if few and steps is not None and steps <= FADING_STEPS else MANY
-        recipe = replace(recipe, opacity_decay=pace.opacity_decay)
+        defaults = FEW if few and steps is not None and steps <= FADING_STEPS else MANY
+        recipe = replace(recipe, opacity_decay=defaults.opacity_decay)
     return replace(config, steps=steps, coarse=config.coarse or 0.0, recipe=recipe)
 
 

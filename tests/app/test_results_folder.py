@@ -31,7 +31,7 @@ from kgs.errors import DataError, TrainingDiverged
 from kgs.fit import trainer as trainer_module
 from kgs.fit.checkpoint import load_checkpoint, previous, save_checkpoint
 from kgs.fit.config import DROP, FitConfig, Recipe
-from kgs.fit.plan import make_plan, with_pace
+from kgs.fit.plan import make_plan, with_step_defaults
 from kgs.fit.prune import prune
 from kgs.fit.trainer import Trainer
 from kgs.metrics import evaluate as measures
@@ -500,7 +500,7 @@ def test_images_that_are_too_small_are_refused_before_any_work(tmp_path: Path) -
 def test_a_saved_fit_renders_what_the_trainer_did(scene: Any, done: Path) -> None:
     request, saved = load_fit(done)
     trainer = Trainer.resume(scene, CONFIG, done / CHECKPOINT)
-    assert trainer.plan.config == with_pace(replace(CONFIG, drop=DROP), len(scene.train))
+    assert trainer.plan.config == with_step_defaults(replace(CONFIG, drop=DROP), len(scene.train))
     assert (saved.settings, request) == (trainer.plan.config, SceneRequest("/photos", 3))
     assert saved.metrics == json.loads((done / "metrics.json").read_text())
     camera = scene.test.camera(0)

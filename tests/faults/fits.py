@@ -30,7 +30,7 @@ def _config(steps: int, points: Path, **changes: Any) -> FitConfig:
     config = FitConfig(steps=steps, drop=0.3, evaluations=steps // 3, max_gaussians=1500, sh_degree=3, recipe=recipe)
     schedule = make_schedule(config)
     if not (schedule.densify and schedule.reset and len(schedule.sh) == 3):
-        raise RuntimeError(f"steps: expected room for all that a fit can do, got {steps}: {times}")
+        raise RuntimeError(f"steps: expected room for all that a fit can do, got {steps}: {schedule}")
     return replace(config, init="file", init_file=points, **changes)
 
 

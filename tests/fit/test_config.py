@@ -13,14 +13,14 @@ import torch
 from kgs import RasterOptions
 from kgs.datasets import synthetic_scene
 from kgs.fit.config import PAPER, PRESETS, FitConfig, Recipe
-from kgs.fit.plan import expected_memory, make_plan, most_gaussians, make_schedule, with_pace
+from kgs.fit.plan import expected_memory, make_plan, most_gaussians, make_schedule, with_step_defaults
 
 
 @pytest.mark.parametrize(
     ("steps", "sh", "densify", "reset"),
     [
         (10_000, (1000, 2000, 3000), range(600, 10_000, 100), (3000, 6000, 9000)),  # the release
-        (2000, (200, 400, 600), range(200, 2000, 100), (600, 1200)),  # on as much evidence, see timetable
+        (2000, (200, 400, 600), range(200, 2000, 100), (600, 1200)),  # on as much evidence, see make_schedule
     ],
 )
 def test_a_short_fit_scales_the_counts_of_the_release(steps, sh, densify, reset):
@@ -49,11 +49,11 @@ def test_the_default_leaves_out_resets_and_harmonics():
 
 @pytest.mark.parametrize(("views", "steps"), [(1, 900), (3, 900), (4, None), (12, None)])
 def test_with_more_than_three_views_the_steps_stay_open_and_opacities_fade_more_slowly(views, steps):
-    config = with_pace(FitConfig(), views)
+    config = with_step_defaults(FitConfig(), views)
     assert (config.steps, config.recipe.opacity_decay) == (steps, 0.9925 if views <= 3 else 0.995)
-    assert with_pace(FitConfig(steps=1001), views).recipe.opacity_decay == 0.995
+    assert with_step_defaults(FitConfig(steps=1001), views).recipe.opacity_decay == 0.995
     given = FitConfig(steps=7, coarse=0.0, recipe=Recipe(opacity_decay=0.5))
-    assert with_pace(given, views) == given
+    assert with_step_defaults(given, views) == given
 
 
 def test_plain_is_paper_without_dropping():
@@ -105,7 +105,7 @@ def test_numpys_numbers_and_paths_as_text_become_pythons():
 
 def test_the_coarse_share_is_counted_in_steps():
     assert make_schedule(FitConfig(steps=2000)).coarse == 0
-    assert with_pace(FitConfig(), 6).coarse == 0
+    assert with_step_defaults(FitConfig(), 6).coarse == 0
     assert make_schedule(FitConfig(steps=1000, coarse=0.5)).coarse == 500
 
 
@@ -117,14 +117,14 @@ SCENE = synthetic_scene(train_views=2, test_views=0, size=(16, 16))
 
 def test_a_plan_has_what_the_configuration_leaves_open_but_for_the_degree():
     plan = make_plan(SCENE, FitConfig(seed=3))
-    assert plan.config == with_pace(FitConfig(seed=3), 2)
+    assert plan.config == with_step_defaults(FitConfig(seed=3), 2)
     assert plan.config.sh_degree is None
     assert plan.schedule == make_schedule(plan.config)
     assert (plan.device, plan.decisions) == (torch.device("cpu"), {})
     assert plan.backend in ("numba", "torch")
 
 
-def test_a_degree_changes_the_timetable_and_says_why():
+def test_a_degree_changes_the_schedule_and_says_why():
     first = make_plan(SCENE, FitConfig(steps=100))
     plan = first.decided({"sh_degree": 2}, {"sh_degree": {"by": "rule"}})
     assert (plan.config.sh_degree, len(plan.schedule.sh)) == (2, 2)

@@ -67,7 +67,7 @@ def test_a_fit_has_the_same_bits_on_any_number_of_threads(set_threads, scene):
 
 
 @pytest.mark.slow
-def test_opacities_decay_or_are_reset_when_the_timetable_says(scene, points, monkeypatch):
+def test_opacities_decay_or_are_reset_when_the_schedule_says(scene, points, monkeypatch):
     done = []
 
     def note(name):

@@ -10,7 +10,7 @@ import torch
 
 from kgs.datasets.synthetic import synthetic_depths
 from kgs.fit import FitConfig, InitialPoints, view_dependence
-from kgs.fit.plan import make_plan, with_pace
+from kgs.fit.plan import make_plan, with_step_defaults
 from kgs.fit.run import choose_points, decide
 from kgs.fit.view_dependence import MIN_GAIN, harmonics_kernel, possible_gain, without_exposure
 from kgs.geometry import ViewGeometry
@@ -146,7 +146,7 @@ def test_surfaces_of_one_colour_need_no_harmonics(arc):
 
 def test_surfaces_with_harmonics_need_them(arc):
     plan = decided(with_harmonics(arc, "arc", 0.1))
-    assert plan.config == with_pace(replace(OPEN, sh_degree=3), 6)
+    assert plan.config == with_step_defaults(replace(OPEN, sh_degree=3), 6)
     assert plan.decisions["sh_degree"]["gain"] > MIN_GAIN
 
 
@@ -163,7 +163,7 @@ def test_harmonics_have_to_gain_enough(monkeypatch, scene, gain, degree):
     patches = made_up()
     plan = decide(make_plan(scene, OPEN), as_points(patches))
     assert plan.config.sh_degree == degree
-    assert plan.schedule == make_plan(scene, plan.config).times
+    assert plan.schedule == make_plan(scene, plan.config).schedule
     found = {"chosen": degree, "by": "photos", "over": 3 - degree, "gain": pytest.approx(gain), "n": len(patches)}
     assert json.loads(json.dumps(plan.decisions)) == {"sh_degree": found}
 

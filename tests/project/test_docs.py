@@ -21,7 +21,7 @@ from kgs.fit.config import DETAILS, DROP, PRESETS, FitConfig
 from kgs.fit.haze import FRONT, HAZE, WINDOW
 from kgs.fit.overlap import MOST_STEPS, STEPS_OF_A_PHOTO
 from kgs.fit.plan import MANY as USUAL
-from kgs.fit.plan import with_pace
+from kgs.fit.plan import with_step_defaults
 from kgs.init_points.dense import FEWEST, MOST, MOST_OF_FEW_VIEWS, PIXELS_OF_A_POINT
 from kgs.metrics.lpips import Lpips
 
@@ -92,7 +92,7 @@ def test_the_examples_of_docstrings_do_what_they_say(module, tmp_path, monkeypat
 # -- numbers ---------------------------------------------------------------------------------------------------------
 
 AUTO, PAPER, LOW, HIGH = FitConfig(), PRESETS["paper"], DETAILS["low"], DETAILS["high"]
-FEW, MANY = with_pace(AUTO, 3), with_pace(AUTO, 4)  # the default for up to three views, and for more
+FEW, MANY = with_step_defaults(AUTO, 3), with_step_defaults(AUTO, 4)  # the default for up to three views, and for more
 STEPS_OF_BOTH = [FEW.steps, MOST_STEPS]
 # A page, what it says with a # for each number, and these numbers.
 NUMBERS = [

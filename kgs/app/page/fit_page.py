@@ -242,7 +242,7 @@ def _ground(views: Views, background: Tensor) -> Tensor:
 
 
 def _settings(config: Mapping[str, Any], metrics: Mapping[str, Any]) -> dict[str, Any]:
-    """The content of config.json in one dict, without the timetable of steps.
+    """The content of config.json in one dict, without the schedule.
 
     Where metrics.json says what was used in place of what was asked for, it is that.
     """
