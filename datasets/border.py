@@ -19,13 +19,13 @@ ALONG = 0.1  # of the side: how far the brightness is averaged along it
 def with_border(train: Views) -> Views:
     """The training views with the dark border of their photos, if these are opaque and have one."""
     has_pixels = train.images.device.type != "meta"
-    if not has_pixels or train.masks is not None:
+    if not has_pixels or train.alphas is not None:
         return train
-    return replace(train, transmittance=border_transmittance(train.images))
+    return replace(train, border_mask=find_border_mask(train.images))
 
 
-def border_transmittance(images: Tensor) -> Tensor | None:
-    """The transmittance of each pixel of these photos, `(H, W)`: below 1 in a dark border.
+def find_border_mask(images: Tensor) -> Tensor | None:
+    """The share of light that each pixel of these photos lets through, `(H, W)`: below 1 in a dark border.
 
     A border lies at the same place in all photos, whatever they show, and ends within 2 % of the width or height; its
     thickness may vary along a side. An edge that is dark in only some photos belongs to the scene, and so does a dark
@@ -40,17 +40,17 @@ def border_transmittance(images: Tensor) -> Tensor | None:
     if len(images) < 2:
         return None
     bright = images.detach().float().amax(dim=1)
-    transmittance = torch.ones(bright.shape[1:], dtype=torch.float32, device=bright.device)
+    mask = torch.ones(bright.shape[1:], dtype=torch.float32, device=bright.device)
     for _ in range(4):  # each side is the top once
         bright = torch.rot90(bright, 1, dims=(-2, -1))
-        transmittance = torch.rot90(transmittance, 1, dims=(-2, -1))
+        mask = torch.rot90(mask, 1, dims=(-2, -1))
         border = _top_border(bright)
-        transmittance[: len(border)] *= border
-    return transmittance if bool((transmittance < 1).any()) else None
+        mask[: len(border)] *= border
+    return mask if bool((mask < 1).any()) else None
 
 
 def _top_border(bright: Tensor) -> Tensor:
-    """The transmittance `(K, W)` of the first rows of photos `(V, H, W)`; K is 0 without a border there."""
+    """The border mask `(K, W)` of the first rows of photos `(V, H, W)`; K is 0 without a border there."""
     height, width = bright.shape[1:]
     most = max(FEWEST_LINES, round(WIDEST * height))
     if height <= 2 * most:

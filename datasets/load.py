@@ -37,7 +37,7 @@ _CLOCKWISE = torch.tensor(
     dtype=torch.float64,
     device="cpu",
 )
-_COUNTED = 0.99  # share of a pixel that a mask keeps, above which it counts
+_VALID = 0.99  # share of a pixel that a mask keeps, above which it counts
 _FINE_PIXELS = 1_000_000  # of an image for the initial points: twice the width and height halves the error of depths
 
 
@@ -84,7 +84,7 @@ def load_scene(
         masks: a folder with masks of the photos, which have their stems; white is kept. None: those that the layout's
             files name, or those in `masks/`, and those beside the photos (`IMG_1_mask.png`, `dynamic_mask_IMG_1.png`).
         mask_means: what black in a mask means. "away": such pixels are ignored (somebody walked by), see
-            `Views.counted`. "absent": nothing is there, as where an image is transparent.
+            `Views.valid_mask`. "absent": nothing is there, as where an image is transparent.
 
     Raises:
         DataError: the folder is not a scene, or its files are missing, damaged or contradict each other.
@@ -128,11 +128,11 @@ def load_scene(
         (test_views,) = make_views(test, scales[:1])
         colors = color_notes([frame.image for frame in (*train, *test)])
         notes = (*frame_set.notes, *_mask_notes([*train, *test], at_size, absent), *colors)
-        if at_size.transmittance is not None:
+        if at_size.border_mask is not None:
             notes += (_BORDER,)
         return Scene(
             train=at_size,
-            test=replace(test_views, transmittance=at_size.transmittance),
+            test=replace(test_views, border_mask=at_size.border_mask),
             points=(cloud.points - offset).float(),
             point_colors=cloud.colors.float(),
             init_kind=cloud.kind,
@@ -162,7 +162,7 @@ def _mask_notes(frames: Sequence[Frame], train: Views, absent: bool) -> list[str
     masked = sum(frame.mask is not None for frame in frames)
     if not masked:
         return []
-    share = "" if train.counted is None else f", {1 - float(train.counted.float().mean()):.0%} of the training pixels"
+    share = "" if train.valid_mask is None else f", {1 - float(train.valid_mask.float().mean()):.0%} of the training pixels"
     meaning = "treated as empty" if absent else f"ignored{share}"
     return [f"masks of {masked} of {len(frames)} photos: black pixels are {meaning}"]
 
@@ -254,7 +254,7 @@ def _views(
     images = [torch.empty(count, 3, *scale.size, dtype=torch.float32, device=device) for scale in scales]
     intrinsics = torch.eye(4, dtype=torch.float32).repeat(len(scales), count, 1, 1)
     alphas: list[dict[int, Tensor]] = [{} for _ in scales]
-    counted: list[dict[int, Tensor]] = [{} for _ in scales]
+    valid: list[dict[int, Tensor]] = [{} for _ in scales]
     turned = [False] * count
     for i, frame in enumerate(frames):
         image = None
@@ -297,7 +297,7 @@ def _views(
                 if len(pixels) == 4:
                     alphas[j][i] = pixels[3:].clone()
                 if kept is not None:
-                    counted[j][i] = torch.from_numpy(resize(kept, lens, width, height)[0]) > _COUNTED
+                    valid[j][i] = torch.from_numpy(resize(kept, lens, width, height)[0]) > _VALID
             intrinsics[j, i, :3, :3] = torch.from_numpy(reduced_lens.matrix())
     poses = torch.zeros(count, 4, 4, dtype=torch.float64)
     for i, frame in enumerate(frames):
@@ -308,10 +308,10 @@ def _views(
     views = []
     for j, scale in enumerate(scales):
         opaque = torch.ones(1, *scale.size, dtype=torch.float32)
-        masks = torch.stack([alphas[j].get(i, opaque) for i in range(count)]) if alphas[j] else None
+        alpha = torch.stack([alphas[j].get(i, opaque) for i in range(count)]) if alphas[j] else None
         every = opaque[0] > 0
-        rows = torch.stack([counted[j].get(i, every) for i in range(count)]) if counted[j] else None
+        rows = torch.stack([valid[j].get(i, every) for i in range(count)]) if valid[j] else None
         cameras = pinholes(intrinsics[j], extrinsics, scale.size)
         kinds = tuple(turned) if any(turned) else None
-        views.append(Views(cameras, images[j], names, masks, counted=rows, turned=kinds))
+        views.append(Views(cameras, images[j], names, alpha, valid_mask=rows, turned=kinds))
     return views

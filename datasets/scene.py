@@ -32,10 +32,10 @@ class Views:
         images: floating point RGB in [0, 1], `(V, 3, H, W)`; on the "meta" device (a shape without pixels) in a scene
             that was loaded with `photos=False`.
         names: file names, unique, in the order of the images.
-        masks: `(V, 1, H, W)` in [0, 1], the images' alpha channel, or None.
-        transmittance: `(H, W)` in [0, 1], the share of light that each pixel lets through, the same in all images, or
+        alphas: `(V, 1, H, W)` in [0, 1], the images' alpha channel, or None.
+        border_mask: `(H, W)` in [0, 1], the share of light that each pixel lets through, the same in all images, or
             None: 1 everywhere. It is below 1 in the dark border that removing a lens's distortion can leave.
-        counted: bool `(V, H, W)`, the pixels that count, or None: all. Where somebody walked by, nothing is compared,
+        valid_mask: bool `(V, H, W)`, the pixels that count, or None: all. Where somebody walked by, nothing is compared,
             and no keypoints or initial points are taken.
         gains: `(V, 3)` above 0, the factors of the scene's colours in each photo: its exposure and white balance; or
             None: 1. They are estimated before a fit, and loaders set none.
@@ -57,9 +57,9 @@ class Views:
     cameras: PinholeCamera
     images: Tensor
     names: tuple[str, ...]
-    masks: Tensor | None = None
-    transmittance: Tensor | None = None
-    counted: Tensor | None = None
+    alphas: Tensor | None = None
+    border_mask: Tensor | None = None
+    valid_mask: Tensor | None = None
     turned: tuple[bool, ...] | None = None
     gains: Tensor | None = None
 
@@ -77,14 +77,14 @@ class Views:
         height, width = self.images.shape[-2:]
         if not bool(((self.cameras.height == height) & (self.cameras.width == width)).all()):
             raise ValueError(f"cameras: expected height {height} and width {width} as images, got others")
-        if self.masks is not None and tuple(self.masks.shape) != (count, 1, height, width):
-            raise ValueError(f"masks: expected shape ({count}, 1, {height}, {width}), got {tuple(self.masks.shape)}")
-        if self.transmittance is not None and tuple(self.transmittance.shape) != (height, width):
+        if self.alphas is not None and tuple(self.alphas.shape) != (count, 1, height, width):
+            raise ValueError(f"alphas: expected shape ({count}, 1, {height}, {width}), got {tuple(self.alphas.shape)}")
+        if self.border_mask is not None and tuple(self.border_mask.shape) != (height, width):
             raise ValueError(
-                f"transmittance: expected shape ({height}, {width}), got {tuple(self.transmittance.shape)}"
+                f"border_mask: expected shape ({height}, {width}), got {tuple(self.border_mask.shape)}"
             )
-        if self.counted is not None and tuple(self.counted.shape) != (count, height, width):
-            raise ValueError(f"counted: expected shape ({count}, {height}, {width}), got {tuple(self.counted.shape)}")
+        if self.valid_mask is not None and tuple(self.valid_mask.shape) != (count, height, width):
+            raise ValueError(f"valid_mask: expected shape ({count}, {height}, {width}), got {tuple(self.valid_mask.shape)}")
         if self.gains is not None and (tuple(self.gains.shape) != (count, 3) or not bool((self.gains > 0).all())):
             raise ValueError(f"gains: expected numbers above 0 of shape ({count}, 3), got {self.gains.tolist()!s:.80}")
         if self.turned is not None and len(self.turned) != count:
@@ -98,16 +98,16 @@ class Views:
 
         Returns:
             image `(3, H, W)`, extrinsics `(4, 4)` and intrinsics `(3, 3)` as `kgs.pinhole_cameras` and
-            `kgs.rasterization` take them with `pixel_centers="integer"`, index, name, mask `(1, H, W)` where there are
-            masks, and counted `(H, W)` where not all pixels count.
+            `kgs.rasterization` take them with `pixel_centers="integer"`, index, name, alpha `(1, H, W)` where
+            images have one, and valid_mask `(H, W)` where not all pixels count.
         """
         if not -len(self) <= (given := operator.index(index)) < len(self):
             raise IndexError(f"index: expected a whole number below {len(self)}, the number of views, got {given}")
         i = given % len(self)
         matrices = {"extrinsics": self.cameras.extrinsics[i], "intrinsics": self.cameras.intrinsics[i, :3, :3]}
-        mask = {} if self.masks is None else {"mask": self.masks[i]}
-        counted = {} if self.counted is None else {"counted": self.counted[i]}
-        return {"image": self.images[i], **matrices, "index": i, "name": self.names[i], **mask, **counted}
+        alpha = {} if self.alphas is None else {"alpha": self.alphas[i]}
+        valid = {} if self.valid_mask is None else {"valid_mask": self.valid_mask[i]}
+        return {"image": self.images[i], **matrices, "index": i, "name": self.names[i], **alpha, **valid}
 
     def __iter__(self) -> Iterator[dict[str, Tensor | int | str]]:
         return (self[i] for i in range(len(self)))
@@ -134,8 +134,8 @@ class Views:
     def select(self, indices: Sequence[int]) -> Self:
         """The views at the given positions, in that order."""
         rows = torch.tensor(indices, dtype=torch.int64, device="cpu")
-        masks = None if self.masks is None else self.masks[rows]
-        counted = None if self.counted is None else self.counted[rows]
+        alphas = None if self.alphas is None else self.alphas[rows]
+        valid_mask = None if self.valid_mask is None else self.valid_mask[rows]
         names = tuple(self.names[i] for i in indices)
         turned = None if self.turned is None else tuple(self.turned[i] for i in indices)
         gains = None if self.gains is None else self.gains[rows]
@@ -144,8 +144,8 @@ class Views:
             cameras=self.camera(rows),
             images=self.images[rows],
             names=names,
-            masks=masks,
-            counted=counted,
+            alphas=alphas,
+            valid_mask=valid_mask,
             turned=turned,
             gains=gains,
         )
@@ -165,7 +165,7 @@ class Views:
         It is clamped to [0, 1], behind the photos' dark border.
         """
         image = image.clamp(0, 1)
-        return image if self.transmittance is None else image * self.transmittance.to(image)
+        return image if self.border_mask is None else image * self.border_mask.to(image)
 
     def compared(self, index: int, image: Tensor) -> tuple[Tensor, Tensor, float]:
         """What :meth:`render` returned as the photo would show it, that photo, and the share of pixels that counts.
@@ -174,17 +174,17 @@ class Views:
         """
         image = self.as_photo(index, image)
         photo = self.images[index].to(image)
-        if self.counted is None:
+        if self.valid_mask is None:
             return image, photo, 1.0
-        counted = self.counted[index].to(image.device)
-        return image * counted, photo * counted, float(counted.float().mean())
+        valid = self.valid_mask[index].to(image.device)
+        return image * valid, photo * valid, float(valid.float().mean())
 
     @property
     def usable(self) -> Tensor | None:
         """Which pixels show the scene: opaque ones that count and no border covers, bool `(V, H, W)`; None: all."""
-        parts = [] if self.masks is None else [self.masks[:, 0] > 0.5]
-        parts += [] if self.transmittance is None else [(self.transmittance >= 1).expand(len(self), -1, -1)]
-        parts += [] if self.counted is None else [self.counted]
+        parts = [] if self.alphas is None else [self.alphas[:, 0] > 0.5]
+        parts += [] if self.border_mask is None else [(self.border_mask >= 1).expand(len(self), -1, -1)]
+        parts += [] if self.valid_mask is None else [self.valid_mask]
         return torch.stack(parts).all(dim=0) if parts else None
 
     def halved(self) -> Self:
@@ -199,11 +199,11 @@ class Views:
         intrinsics[:, :2, :3] *= 0.5
         intrinsics[:, :2, 2] -= 0.25  # (c + 1/2) / 2 - 1/2: pixel centres are integers
         cameras = pinholes(intrinsics, self.cameras.extrinsics, size)
-        masks = None if self.masks is None else avg_pool2d(self.masks, 2)
-        transmittance = None if self.transmittance is None else avg_pool2d(self.transmittance[None], 2)[0]
-        counted = None if self.counted is None else avg_pool2d(self.counted.float(), 2) == 1
+        alphas = None if self.alphas is None else avg_pool2d(self.alphas, 2)
+        border_mask = None if self.border_mask is None else avg_pool2d(self.border_mask[None], 2)[0]
+        valid_mask = None if self.valid_mask is None else avg_pool2d(self.valid_mask.float(), 2) == 1
         images = avg_pool2d(self.images, 2)
-        return replace(self, cameras=cameras, images=images, masks=masks, transmittance=transmittance, counted=counted)
+        return replace(self, cameras=cameras, images=images, alphas=alphas, border_mask=border_mask, valid_mask=valid_mask)
 
 
 @dataclass(frozen=True, eq=False)

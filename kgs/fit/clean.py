@@ -277,8 +277,8 @@ def _changes(fit: Fit, rows: Tensor, bar: ProgressBar) -> Tensor:
             factors = torch.ones_like(changes).requires_grad_()
             image = renderer(replace(gaussians, opacities=factors * gaussians.opacities), camera).image
             signs = 2.0 * torch.randint(0, 2, image.shape, generator=generator).to(image) - 1.0
-            if views.counted is not None:
-                signs *= views.counted[i].to(image)
+            if views.valid_mask is not None:
+                signs *= views.valid_mask[i].to(image)
             image.backward(signs)
             if factors.grad is not None:
                 squares += factors.grad.square()

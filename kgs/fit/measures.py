@@ -64,7 +64,7 @@ def measure(fit: Fit, lpips: Lpips | None = None, look: Callable[[int, Tensor], 
     poses = "poses as given (estimated with all views in real scenes, the field's protocol)"
     if fit.history["poses"] is not None:
         poses += ", those of the training views refined by the fit"
-    everywhere = all(views.counted is None for views in (scene.train, scene.test))
+    everywhere = all(views.valid_mask is None for views in (scene.train, scene.test))
     pixels = "all pixels" if everywhere else "the pixels that count; SSIM and LPIPS take the others as equal"
     coverage = Coverage(scene, fit.median_depth)
 

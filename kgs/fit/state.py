@@ -211,8 +211,8 @@ def fingerprint(scene: Scene) -> dict[str, Any]:
     def of(views: Views) -> dict[str, Any]:
         tensors = {
             "photos": views.images,
-            "masks": views.masks,
-            "counted pixels": views.counted,
+            "alphas": views.alphas,
+            "valid pixels": views.valid_mask,
             "poses": views.cameras.extrinsics,
             "intrinsics": views.cameras.intrinsics,
         }

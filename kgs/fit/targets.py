@@ -24,13 +24,13 @@ class Target(NamedTuple):
     clear: Tensor | None  # (1, 1, H, W), the share of the background in each pixel; None: 0 everywhere
     background: Tensor  # (3,), the background that `image` has
     gains: Tensor | None  # (3, 1, 1), the factors of the scene's colours in the photo; None: 1
-    transmittance: Tensor | None  # (H, W), that of a dark border, and 0 where no pixel counts; None: 1 everywhere
+    border_mask: Tensor | None  # (H, W), that of a dark border, and 0 where no pixel counts; None: 1 everywhere
 
     def seen(self, render: Tensor) -> Tensor:
         """A render as the photo would show it: exposed, clamped to 1, behind its border, black where nothing counts."""
         exposed = render if self.gains is None else render * self.gains
         image: Tensor = _AtMostOne.apply(exposed)  # it is never below 0
-        return image if self.transmittance is None else image * self.transmittance
+        return image if self.border_mask is None else image * self.border_mask
 
     def behind(self, background: Tensor | None) -> Tensor | None:
         """What to render before, so that :meth:`seen` shows this background, `(3,)`: photos have it unexposed."""
@@ -70,13 +70,13 @@ def targets(views: Views, background: Tensor, device: torch.device) -> list[Targ
     made = []
     for i, photo in enumerate(views.images):
         image = photo[None].to(device, torch.float32)
-        clear = None if views.masks is None else 1.0 - views.masks[i][None].to(image)
-        transmittance = None if views.transmittance is None else views.transmittance.to(image)
-        if views.counted is not None:
-            counted = views.counted[i].to(image)
-            image = image * counted
-            clear = None if clear is None else clear * counted
-            transmittance = counted if transmittance is None else transmittance * counted
+        clear = None if views.alphas is None else 1.0 - views.alphas[i][None].to(image)
+        border_mask = None if views.border_mask is None else views.border_mask.to(image)
+        if views.valid_mask is not None:
+            valid = views.valid_mask[i].to(image)
+            image = image * valid
+            clear = None if clear is None else clear * valid
+            border_mask = valid if border_mask is None else border_mask * valid
         made.append(
             Target(
                 camera=move_camera(views.camera(i), device),
@@ -85,7 +85,7 @@ def targets(views: Views, background: Tensor, device: torch.device) -> list[Targ
                 clear=clear,
                 background=background.to(image),
                 gains=None if views.gains is None else views.gains[i, :, None, None].to(image),
-                transmittance=transmittance,
+                border_mask=border_mask,
             )
         )
     return made

@@ -53,9 +53,9 @@ class Coverage:
         covered = views_that_show(depth, camera, self._depths, self._scene.train.cameras) >= MIN_VIEWS
         image, photo, _ = test.compared(view, image[0].cpu())
         errors = (image - photo).square().mean(dim=0)
-        counted = torch.ones_like(covered) if test.counted is None else test.counted[view].cpu()
-        self._shares.append(float(covered[counted].float().mean()) if counted.any() else 0.0)
-        for name, where in (("psnr", covered & counted), ("psnr_rest", ~covered & counted)):
+        valid = torch.ones_like(covered) if test.valid_mask is None else test.valid_mask[view].cpu()
+        self._shares.append(float(covered[valid].float().mean()) if valid.any() else 0.0)
+        for name, where in (("psnr", covered & valid), ("psnr_rest", ~covered & valid)):
             error = float(errors[where].mean()) if where.any() else 0.0
             if error > 0:
                 self._levels[name].append(-10 * math.log10(error))

@@ -1,7 +1,7 @@
 """Measures renders against photos: PSNR, SSIM with both borders, LPIPS.
 
 Compared are float renders, clamped to [0, 1], never 8-bit files, over all pixels and channels (alpha is not used). The
-photos' dark border, if any, is applied to the renders first. Pixels that do not count (`Views.counted`) are black in
+photos' dark border, if any, is applied to the renders first. Pixels that do not count (`Views.valid_mask`) are black in
 both; PSNR is that of the others, while SSIM and LPIPS take the black ones as equal.
 
 Sources: the SSIM of the published tables is that of B. Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance
@@ -57,7 +57,7 @@ def evaluate(
         published tables), "lpips_vgg" (images in [-1, 1], as in its training) and "lpips_vgg_unscaled" (in [0, 1],
         as in the published tables); under "views" a list with "name" and the same keys for each view. None stands for
         what was not measured, and for an infinite PSNR (a render equal to its photo, or a mean with one). Where not all
-        pixels count, "counted" is the share that does.
+        pixels count, "valid" is the share that does.
     """
     rows = list[dict[str, Any]]()
     shares = list[float]()
@@ -72,19 +72,19 @@ def evaluate(
             look(index, image)
         shown, photo, share = views.compared(index, image)
         if recolor:
-            counted = None if views.counted is None else views.counted[index]
+            valid = None if views.valid_mask is None else views.valid_mask[index]
             through = None
-            if views.masks is not None and views.gains is not None:
-                through = Through(render(views.camera(index), torch.zeros(3)), views.masks[index].to(image))
-                if views.transmittance is not None:  # the border darkens the background, too
-                    counted = (views.transmittance >= 1) & (True if counted is None else counted)
-            shown, _, _ = views.compared(index, recolored(image, shown, photo, counted, through))
+            if views.alphas is not None and views.gains is not None:
+                through = Through(render(views.camera(index), torch.zeros(3)), views.alphas[index].to(image))
+                if views.border_mask is not None:  # the border darkens the background, too
+                    valid = (views.border_mask >= 1) & (True if valid is None else valid)
+            shown, _, _ = views.compared(index, recolored(image, shown, photo, valid, through))
         shares.append(share)
         rows.append(_measure(shown, photo[None], share, lpips))
     columns = {key: [row[key] for row in rows] for key in MEASURES}
     means = {key: fmean(values) if values and None not in values else None for key, values in columns.items()}
-    if views.counted is not None and shares:
-        means["counted"] = round(fmean(shares), 4)
+    if views.valid_mask is not None and shares:
+        means["valid"] = round(fmean(shares), 4)
     return {**means, "views": [{"name": name, **row} for name, row in zip(views.names, rows, strict=True)]}
 
 
@@ -107,9 +107,9 @@ def recolored(
     """A render `(1, 3, H, W)` with the gain and offset of each channel that fit `shown` to the photo `(3, H, W)`.
 
     `shown` is the render as it is compared with the photo; least squares in float64 over the pixels `(H, W)` that
-    are counted, or over all. The background that shows through gets neither gain nor offset.
+    are valid, or over all. The background that shows through gets neither gain nor offset.
     """
-    every = slice(None) if counted is None or not bool(counted.any()) else counted.flatten().to(shown.device)
+    every = slice(None) if valid is None or not bool(valid.any()) else valid.flatten().to(shown.device)
     behind, alpha = (torch.zeros_like(image), torch.ones_like(image[0, :1])) if through is None else through
     x = (shown - behind)[0].flatten(1)[:, every].double()
     y = (photo - behind[0]).flatten(1)[:, every].double()
@@ -206,7 +206,7 @@ def as_text(metrics: dict[str, Any]) -> str:
         values = metrics.get(part) or {}
         measured = [f"{title} {values[key]:.4g}" for key, title in names.items() if values.get(key) is not None]
         if measured:
-            share = values.get("counted")
+            share = values.get("valid")
             where = "" if share is None else f" (of {share:.0%} of the pixels: masks leave out the rest)"
             adjusted = ", each render in the colours that fit its photo best" if part == "recolored" else ""
             lines.append(f"{'test' if adjusted else part:>5}: {', '.join(measured)}{where}{adjusted}")

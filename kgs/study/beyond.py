@@ -162,7 +162,7 @@ def from_the_middle(scene: Scene, count: int) -> Scene:
     held_out = min(ceil(OUTER * len(order)), len(order) - count)
     middle = sorted(order[:count])
     train = with_border(views.select(middle))  # that of all photos would depend on those held out
-    test = replace(views.select(sorted(order[len(order) - held_out :])), transmittance=train.transmittance)
+    test = replace(views.select(sorted(order[len(order) - held_out :])), border_mask=train.border_mask)
     finer = None if scene.finer is None else with_border(scene.finer.select(middle))
     return replace(scene, train=train, test=test, finer=finer)
 

@@ -217,20 +217,20 @@ def test_eval_adds_lpips_to_measures_and_page(done: Path, monkeypatch: Any, caps
     assert is_own(done, "metrics.json")
 
 
-def flat_views(masks: Any = None, transmittance: Any = None) -> Views:
+def flat_views(masks: Any = None, border_mask: Any = None) -> Views:
     """Two photos of 20 x 30 pixels: grey inside, of two colours at the border."""
     images = torch.full((2, 3, 20, 30), 0.5)
     for image, colour in zip(images, ([0.2, 0.4, 0.6], [0.4, 0.4, 0.8]), strict=True):
         image[:, [0, -1], :] = torch.tensor(colour)[:, None, None]
         image[:, :, [0, -1]] = torch.tensor(colour)[:, None, None]
-    return replace(random_views(2, 20, 30), images=images, masks=masks, transmittance=transmittance)
+    return replace(random_views(2, 20, 30), images=images, alphas=masks, border_mask=border_mask)
 
 
 def test_the_ground_is_the_mean_of_the_photos_border() -> None:
     black = torch.zeros(3)
     torch.testing.assert_close(fit_page._ground(flat_views(), black), torch.tensor([0.3, 0.4, 0.7]))
-    assert torch.equal(fit_page._ground(flat_views(masks=torch.ones(2, 1, 20, 30)), black), black)
+    assert torch.equal(fit_page._ground(flat_views(alphas=torch.ones(2, 1, 20, 30)), black), black)
     assert torch.equal(fit_page._ground(flat_views(), torch.ones(3)), torch.ones(3))
     light = torch.zeros(20, 30)
     light[3:-3, 3:-3] = 1.0  # a dark border that no photo shows the scene in
-    torch.testing.assert_close(fit_page._ground(flat_views(transmittance=light), black), torch.full((3,), 0.5))
+    torch.testing.assert_close(fit_page._ground(flat_views(border_mask=light), black), torch.full((3,), 0.5))

@@ -29,10 +29,10 @@ def test_a_quarter_turn_of_the_cameras_turns_the_render_clockwise(degrees: float
     expected = torch.rot90(render, -quarters, (-2, -1))
     torch.testing.assert_close(render_turned, expected, rtol=0, atol=1e-10)
     assert torch.equal(turned.images, torch.rot90(straight.images, -quarters, (-2, -1)))
-    assert turned.masks is not None
-    assert torch.equal(turned.masks, turned.images[:, :1])
-    assert turned.transmittance is not None
-    assert torch.equal(turned.transmittance, turned.images[0, 0])
+    assert turned.alphas is not None
+    assert torch.equal(turned.alphas, turned.images[:, :1])
+    assert turned.border_mask is not None
+    assert torch.equal(turned.border_mask, turned.images[0, 0])
 
 
 def test_a_small_angle_tilts_the_scene_within_the_frame() -> None:

@@ -33,9 +33,9 @@ def test_nothing_is_matched_where_a_mask_is_black(tmp_path):
     for name in NAMES[:2]:
         assert places[name][:, 0].min() >= 39
     assert places[NAMES[2]][:, 0].min() < 39
-    counted = load_scene(tmp_path / "out", hold_out=0).train.counted
-    assert counted is not None
-    assert counted.float().mean((1, 2)).tolist() == pytest.approx([5 / 6, 5 / 6, 1.0], abs=0.02)
+    valid = load_scene(tmp_path / "out", hold_out=0).train.valid_mask
+    assert valid is not None
+    assert valid.float().mean((1, 2)).tolist() == pytest.approx([5 / 6, 5 / 6, 1.0], abs=0.02)
     assert pose_photos(photos, tmp_path / "out")["reused"]
     (photos / "masks" / NAMES[0]).unlink()
     assert not pose_photos(photos, tmp_path / "out")["reused"]  # the masks changed

@@ -40,9 +40,9 @@ def test_images_lie_on_the_background_and_alpha_is_the_mask(tmp_path: Path) -> N
         expected = torch.tensor([200, 100, 0]) / 255 * 0.2 + behind
         torch.testing.assert_close(scene.train.images[1, :, 5, 5], expected)
         assert scene.background.tolist() == [behind / 0.8 if behind else 0.0] * 3
-        assert scene.train.masks is not None
-        assert float(scene.train.masks[1].mean()) == pytest.approx(0.2)
-        assert float(scene.train.masks[0].min()) == 1.0
+        assert scene.train.alphas is not None
+        assert float(scene.train.alphas[1].mean()) == pytest.approx(0.2)
+        assert float(scene.train.alphas[0].min()) == 1.0
 
 
 def test_reducing_mixes_colours_in_proportion_to_alpha(tmp_path: Path) -> None:

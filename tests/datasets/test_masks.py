@@ -114,14 +114,14 @@ def written_as(name: str) -> Callable[[Path], None]:
 def test_black_is_looked_away_from(tmp_path: Path, write: Callable[[Path], None]) -> None:
     write(tmp_path)
     scene = load_scene(tmp_path, hold_out=0)
-    counted = scene.train.counted
-    assert counted is not None
-    assert bool(counted[1:].all())  # photos without a mask count
-    kept = torch.nonzero(counted[0])
+    valid = scene.train.valid_mask
+    assert valid is not None
+    assert bool(valid[1:].all())  # photos without a mask count
+    kept = torch.nonzero(valid[0])
     assert 7 <= int(kept[:, 1].min()) <= 9
-    assert 0.4 < float(counted[0].float().mean()) < 0.6
+    assert 0.4 < float(valid[0].float().mean()) < 0.6
     assert any("masks of 1 of 3 photos" in note for note in scene.notes)
-    assert scene.train.masks is None
+    assert scene.train.alphas is None
 
 
 @pytest.mark.parametrize("name", ["0_mask.png", "0.png.png", "dynamic_mask_0.png"])
@@ -131,7 +131,7 @@ def test_masks_among_photos_are_not_counted_as_photos(tmp_path: Path, name: str)
     write_mask(tmp_path / "images" / name)
     scene = load_scene(tmp_path, hold_out=0)
     assert len(scene.train) == 3
-    assert scene.train.counted is not None
+    assert scene.train.valid_mask is not None
 
 
 @pytest.mark.parametrize(
@@ -170,7 +170,7 @@ def test_a_photo_of_llff_may_be_called_like_another_one_with_an_ending(tmp_path:
     photos[1].rename(photos[0].with_name(f"{photos[0].name}.jpg"))
     scene = load_scene(tmp_path, hold_out=0)
     assert len(scene.train) == 3
-    assert scene.train.counted is None
+    assert scene.train.valid_mask is None
 
 
 def test_photos_whose_names_only_look_like_masks_stay_photos(tmp_path: Path) -> None:
@@ -178,13 +178,13 @@ def test_photos_whose_names_only_look_like_masks_stay_photos(tmp_path: Path) -> 
     write_llff(tmp_path)
     for path in sorted((tmp_path / "images").iterdir()):
         path.rename(path.with_name(f"mask_{path.name}"))
-    assert load_scene(tmp_path, hold_out=0).train.counted is None
+    assert load_scene(tmp_path, hold_out=0).train.valid_mask is None
     write_nerfstudio(tmp_path / "named")
     data = json.loads((tmp_path / "named" / "transforms.json").read_text())
     (tmp_path / "named" / "images" / "1.png").rename(tmp_path / "named" / "images" / "0_mask.png")
     data["frames"][1]["file_path"] = "images/0_mask.png"
     (tmp_path / "named" / "transforms.json").write_text(json.dumps(data))
-    assert load_scene(tmp_path / "named", hold_out=0).train.counted is None
+    assert load_scene(tmp_path / "named", hold_out=0).train.valid_mask is None
 
 
 def test_a_picture_beside_photos_that_is_called_like_a_mask_is_named(tmp_path: Path) -> None:
@@ -209,12 +209,12 @@ def test_black_is_not_there(tmp_path: Path) -> None:
     write_llff(tmp_path)
     write_mask(tmp_path / "others" / "0.png")
     scene = load_scene(tmp_path, hold_out=0, masks=tmp_path / "others", mask_means="absent", background="white")
-    assert scene.train.counted is None
-    assert scene.train.masks is not None
-    assert scene.train.masks.mean((1, 2, 3)).tolist() == pytest.approx([0.5, 1.0, 1.0])
+    assert scene.train.valid_mask is None
+    assert scene.train.alphas is not None
+    assert scene.train.alphas.mean((1, 2, 3)).tolist() == pytest.approx([0.5, 1.0, 1.0])
     assert bool((scene.train.images[0, :, :, :8] == 1).all())  # the background
     plain = load_scene(tmp_path, hold_out=0)
-    assert plain.train.counted is None
+    assert plain.train.valid_mask is None
     assert torch.equal(plain.train.images[0, :, :, 8:], scene.train.images[0, :, :, 8:])
 
 
@@ -234,16 +234,16 @@ def test_a_mask_is_reduced_with_its_photo(tmp_path: Path) -> None:
     mask[5, 7] = 0
     write_mask(tmp_path / "masks" / "1.png", mask)
     views = load_scene(tmp_path, hold_out=0, downscale=2).train
-    assert views.counted is not None
-    assert (~views.counted).nonzero().tolist() == [[1, 2, 3]]  # a pixel that a mask covers in part does not count
+    assert views.valid_mask is not None
+    assert (~views.valid_mask).nonzero().tolist() == [[1, 2, 3]]  # a pixel that a mask covers in part does not count
     again = load_scene(tmp_path, hold_out=0).train
     halved = again.halved()
-    assert halved.counted is not None
-    assert torch.equal(halved.counted, views.counted)
+    assert halved.valid_mask is not None
+    assert torch.equal(halved.valid_mask, views.valid_mask)
     chosen = again.select([1])
-    assert chosen.counted is not None
-    assert int((~chosen.counted).sum()) == 1
-    assert [int((~view["counted"]).sum()) for view in again] == [0, 1, 0]
+    assert chosen.valid_mask is not None
+    assert int((~chosen.valid_mask).sum()) == 1
+    assert [int((~view["valid_mask"]).sum()) for view in again] == [0, 1, 0]
 
 
 @pytest.mark.parametrize(
@@ -302,7 +302,7 @@ def test_a_mask_of_a_photo_that_is_not_in_the_model_is_no_error(tmp_path: Path) 
     cv2.imwrite(str(tmp_path / "images" / "not registered.png"), LEFT)
     write_mask(tmp_path / "masks" / "not registered.png")
     write_mask(tmp_path / "masks" / "0.png")
-    assert load_scene(tmp_path, hold_out=0).train.counted is not None
+    assert load_scene(tmp_path, hold_out=0).train.valid_mask is not None
 
 
 def test_the_folder_of_photos_is_listed_as_often_for_many_masks_as_for_few(
@@ -328,9 +328,9 @@ def test_the_folder_of_photos_is_listed_as_often_for_many_masks_as_for_few(
 def half() -> Views:
     """Three views of which the left half does not count."""
     views = painted_planes()
-    counted = torch.ones(views.images[:, 0].shape, dtype=torch.bool)
-    counted[:, :, : counted.shape[2] // 2] = False
-    return Views(views.cameras, views.images, views.names, counted=counted)
+    valid = torch.ones(views.images[:, 0].shape, dtype=torch.bool)
+    valid[:, :, : valid.shape[2] // 2] = False
+    return Views(views.cameras, views.images, views.names, valid_mask=valid)
 
 
 def test_no_keypoint_lies_where_no_pixel_counts(half: Views) -> None:
@@ -343,29 +343,29 @@ def test_the_loss_has_no_gradient_where_no_pixel_counts(half: Views) -> None:
     for view, target in enumerate(targets(half, torch.zeros(3), torch.device("cpu"))):
         render = torch.full_like(target.image, 0.4).requires_grad_()
         (gradient,) = torch.autograd.grad((target.seen(render) - target.image).square().sum(), render)
-        assert half.counted is not None
-        assert torch.equal(gradient[0].any(0), half.counted[view])
+        assert half.valid_mask is not None
+        assert torch.equal(gradient[0].any(0), half.valid_mask[view])
 
 
 def test_only_pixels_that_count_are_measured(half: Views) -> None:
-    assert half.counted is not None
-    renders = iter(torch.where(half.counted[:, None], half.images + 0.01, 0.5).clamp(0, 1)[:, None])
+    assert half.valid_mask is not None
+    renders = iter(torch.where(half.valid_mask[:, None], half.images + 0.01, 0.5).clamp(0, 1)[:, None])
     plain = Views(half.cameras, half.images, half.names)
     shown = evaluate(lambda _: next(renders), half)
     renders = iter((half.images + 0.01).clamp(0, 1)[:, None])
     whole = evaluate(lambda _: next(renders), plain)
     assert shown["psnr"] == pytest.approx(40.0, abs=0.1)
     assert shown["psnr"] == pytest.approx(whole["psnr"], abs=0.1)
-    assert shown["counted"] == 0.5
-    assert "counted" not in whole
-    renders = iter(torch.where(half.counted[:, None], half.images + 0.01, 0.5).clamp(0, 1)[:, None])
+    assert shown["valid"] == 0.5
+    assert "valid" not in whole
+    renders = iter(torch.where(half.valid_mask[:, None], half.images + 0.01, 0.5).clamp(0, 1)[:, None])
     assert mean_psnr(lambda _: next(renders), half) == pytest.approx(shown["psnr"], abs=1e-3)
 
 
 def test_a_folder_of_masks_without_pictures_is_passed_over_unless_it_is_named(tmp_path: Path) -> None:
     write_llff(tmp_path)
     write_mask(tmp_path / "masks" / "of_another_kind.txt.d" / "0.png")
-    assert load_scene(tmp_path, hold_out=0).train.counted is None
+    assert load_scene(tmp_path, hold_out=0).train.valid_mask is None
     with pytest.raises(DataError, match="masks: "):
         load_scene(tmp_path, hold_out=0, masks=tmp_path / "masks")
 
@@ -382,7 +382,7 @@ def test_a_colour_that_a_mask_leaves_out_does_not_show_beside_it(tmp_path: Path)
         cv2.imwrite(str(path), np.where(kept[..., None] > 0, np.uint8([30, 60, 200]), np.uint8([255, 255, 255])))
         write_mask(tmp_path / "masks" / path.with_suffix(".png").name, kept)
     views = load_scene(tmp_path, hold_out=0, downscale=scale / 3).train
-    assert views.counted is not None
-    assert 0.3 < float(views.counted.float().mean()) < 0.95
-    seen = views.images.permute(0, 2, 3, 1)[views.counted]
+    assert views.valid_mask is not None
+    assert 0.3 < float(views.valid_mask.float().mean()) < 0.95
+    seen = views.images.permute(0, 2, 3, 1)[views.valid_mask]
     torch.testing.assert_close(seen, torch.tensor([200.0, 60.0, 30.0]).expand_as(seen) / 255, atol=1e-5, rtol=0)

@@ -50,7 +50,7 @@ def test_views_are_a_data_set_of_dicts():
         assert torch.equal(view["image"], given.images[i])
         assert torch.equal(view["extrinsics"], given.cameras.extrinsics[i])
         assert torch.equal(view["intrinsics"], given.cameras.intrinsics[i, :3, :3])
-        assert torch.equal(view["mask"], given.masks[i])
+        assert torch.equal(view["alpha"], given.alphas[i])
         assert (view["index"], view["name"]) == (i, "ab"[i])
     assert given[-1]["name"] == given[np.int64(1)]["name"] == "b"
     for index in (2, -3):
@@ -58,7 +58,7 @@ def test_views_are_a_data_set_of_dicts():
             given[index]
     with pytest.raises(TypeError):
         given["a"]
-    assert "mask" not in synthetic_scene(train_views=1, test_views=0, size=(6, 8)).train[0]
+    assert "alpha" not in synthetic_scene(train_views=1, test_views=0, size=(6, 8)).train[0]
 
 
 def test_comparing_does_not_raise():

@@ -62,9 +62,9 @@ def test_the_rarer_kind_is_turned_with_its_camera(tmp_path: Path, turned: int, d
     assert plain.turned is None
     assert close(mixed.cameras, plain.cameras)
     assert torch.equal(mixed.images, plain.images)
-    assert mixed.counted is not None
-    assert plain.counted is not None
-    assert torch.equal(mixed.counted, plain.counted)
+    assert mixed.valid_mask is not None
+    assert plain.valid_mask is not None
+    assert torch.equal(mixed.valid_mask, plain.valid_mask)
 
 
 def test_where_most_photos_are_upright_the_lying_ones_are_turned(tmp_path: Path):

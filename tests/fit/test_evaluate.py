@@ -127,7 +127,7 @@ def test_lpips_that_is_not_measured_again_is_kept():
 
 def test_masked_views_without_gains_are_recoloured_for_a_render_that_takes_a_camera_only():
     views = random_views()
-    masked = replace(views, masks=torch.full_like(views.images[:, :1], 0.5))
+    masked = replace(views, alphas=torch.full_like(views.images[:, :1], 0.5))
     render = renderer_of(distort(views.images))
     assert evaluate(render, masked, recolor=True) == evaluate(render, views, recolor=True)
     none = torch.zeros(0, 3)

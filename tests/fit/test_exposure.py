@@ -163,7 +163,7 @@ def test_what_is_seen_through_a_photo_has_no_exposure():
     for behind in (torch.zeros(3), torch.ones(3)):
         images = surface * gain + (1 - alpha) * behind[:, None, None]
         gains = gain[:, 0, 0].repeat(len(images), 1)
-        target = targets(replace(scene.train, images=images, masks=alpha, gains=gains), behind, torch.device("cpu"))[0]
+        target = targets(replace(scene.train, images=images, alphas=alpha, gains=gains), behind, torch.device("cpu"))[0]
         for color in (behind, torch.tensor([0.1, 0.6, 0.3])):
             view = target.over(color, "torch")
             render = surface[:1] + (1 - alpha[:1]) * view.behind(color)[:, None, None]
@@ -193,8 +193,8 @@ def see_through(request):
         surface = torch.cat([each.image for each in rendered]).detach()
         alpha = torch.cat([each.alpha for each in rendered]).detach()
         images = surface * GAIN[:, None, None] + (1 - alpha) * behind[:, None, None]
-        parts.append(replace(views, images=images, masks=alpha))
-    assert 0.1 < float(parts[0].masks.mean()) < 0.9
+        parts.append(replace(views, images=images, alphas=alpha))
+    assert 0.1 < float(parts[0].alphas.mean()) < 0.9
     train, test = parts
     gains = GAIN.repeat(len(train), 1)
     scene = replace(scene, train=replace(train, gains=gains), test=test, background=behind)

@@ -55,10 +55,10 @@ def test_only_what_brightens_dark_places_from_before_the_surface_is_a_veil(scene
 def test_pixels_that_do_not_count_tell_nothing(scene):
     fit = wall(scene, opacity=0.2)
     counts = torch.ones(3, 48, 64, dtype=torch.bool)
-    assert veils(replace(fit, scene=replace(scene, train=replace(scene.train, counted=counts)))).any()
+    assert veils(replace(fit, scene=replace(scene, train=replace(scene.train, valid_mask=counts)))).any()
     views, rows, columns = hazy_pixels(fit)
     counts[views, rows, columns] = False
-    assert not veils(replace(fit, scene=replace(scene, train=replace(scene.train, counted=counts)))).any()
+    assert not veils(replace(fit, scene=replace(scene, train=replace(scene.train, valid_mask=counts)))).any()
 
 
 def hazy_pixels(fit):

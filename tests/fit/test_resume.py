@@ -79,10 +79,10 @@ def test_other_views_masks_and_background_are_named(scene, saved):
     views = scene.train
     for other, said in (
         (replace(scene, train=views.select([0, 1])), "names of the training views"),
-        (replace(scene, train=replace(views, masks=torch.ones(3, 1, 32, 40))), "masks of the training views"),
+        (replace(scene, train=replace(views, alphas=torch.ones(3, 1, 32, 40))), "alphas of the training views"),
         (
-            replace(scene, train=replace(views, counted=torch.ones(3, 32, 40, dtype=torch.bool))),
-            "counted pixels of the training views",
+            replace(scene, train=replace(views, valid_mask=torch.ones(3, 32, 40, dtype=torch.bool))),
+            "valid pixels of the training views",
         ),
         (replace(scene, background=torch.tensor([1.0, 1.0, 1.0])), "background"),
     ):

@@ -343,7 +343,7 @@ def test_dark_photos_become_opaque_before_random_backgrounds_alone(scene, points
 @pytest.mark.slow
 def test_transparent_photos_stay_transparent_before_random_backgrounds(scene, points):
     masks = torch.zeros_like(scene.train.images[:, :1])
-    clear = replace(scene, train=replace(scene.train, images=torch.zeros_like(scene.train.images), masks=masks))
+    clear = replace(scene, train=replace(scene.train, images=torch.zeros_like(scene.train.images), alphas=masks))
     trainer = begun(clear, points, steps=60, drop=0.0)
     alphas = []
     for steps in (0, 59):

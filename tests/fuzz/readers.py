@@ -102,8 +102,8 @@ def check_scene(scene: Scene) -> None:
 
 def _check_views(views: Views) -> None:
     check_range("images", views.images, 0, 1)
-    if views.masks is not None:
-        check_range("masks", views.masks, 0, 1)
+    if views.alphas is not None:
+        check_range("alphas", views.alphas, 0, 1)
     check_range("intrinsics", views.cameras.intrinsics)
     check_range("extrinsics", views.cameras.extrinsics)
     check_range("focal lengths", torch.stack([views.cameras.fx, views.cameras.fy]), 1e-30)

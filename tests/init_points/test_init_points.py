@@ -118,7 +118,7 @@ def test_random_points_have_the_colours_of_what_counts() -> None:
     views = flat()
     counted = torch.ones(views.images[:, 0].shape, dtype=torch.bool)
     counted[..., : counted.shape[-1] // 2] = False
-    shown = replace(views, images=views.images * counted[:, None], counted=counted)
+    shown = replace(views, images=views.images * counted[:, None], valid_mask=counted)
     colors = initial_points(shown, "random", count=500).colors
     black = (colors == 0).all(1)  # seen where no pixel counts
     assert 0.05 < float(black.float().mean()) < 0.6

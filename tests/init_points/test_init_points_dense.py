@@ -82,7 +82,7 @@ def test_points_lie_on_the_surfaces(large: tuple[Views, torch.Tensor]) -> None:
 def test_points_lie_where_the_masks_are(views: Views, span: tuple[float, float]) -> None:
     masks = torch.zeros(3, 1, 72, 96)
     masks[..., 15:55, 20:80] = 1.0
-    points, *_ = dense_points(replace(views, masks=masks), *span, 2000, generator())
+    points, *_ = dense_points(replace(views, alphas=masks), *span, 2000, generator())
     pixels, _ = project_points(points, views.cameras)
     x, y = pixels.round().long().unbind(-1)
     inside = (x >= 20) & (x < 80) & (y >= 15) & (y < 55)

@@ -132,9 +132,9 @@ def test_a_border_is_that_of_the_photos_in_the_middle(tmp_path):
     whole = Scene(views, views.select([]), none, none, "none", torch.zeros(3), torch.zeros(3), tmp_path)
     scene = from_the_middle(whole, 3)
     for part in (scene.train, scene.test):
-        assert part.transmittance is not None
-        torch.testing.assert_close(part.transmittance[0], torch.full((40,), 0.5))
-        assert float(part.transmittance[1:].min()) == 1.0
+        assert part.border_mask is not None
+        torch.testing.assert_close(part.border_mask[0], torch.full((40,), 0.5))
+        assert float(part.border_mask[1:].min()) == 1.0
 
 
 def test_cells_are_there_once_the_synthetic_ones_first(tmp_path):

@@ -104,9 +104,9 @@ def rolled(views: Views, degrees: float) -> Views:
         views,
         cameras=pinholes(lenses, poses, (height, width)),
         images=turned(views.images),
-        masks=None if views.masks is None else turned(views.masks),
-        transmittance=None if views.transmittance is None else turned(views.transmittance),
-        counted=None if views.counted is None else turned(views.counted),
+        alphas=None if views.alphas is None else turned(views.alphas),
+        border_mask=None if views.border_mask is None else turned(views.border_mask),
+        valid_mask=None if views.valid_mask is None else turned(views.valid_mask),
     )
 
 

@@ -227,15 +227,15 @@ def _ground(views: Views, background: Tensor) -> Tensor:
 
     `background` itself if the photos have transparency, and so show a thing before it, or if it is not black.
     """
-    if views.masks is not None or not len(views) or bool(background.any()):
+    if views.alphas is not None or not len(views) or bool(background.any()):
         return background
     height, width = views.images.shape[-2:]
     band = math.ceil(_BORDER * min(height, width))
     border = torch.ones(height, width, dtype=torch.bool)
     border[band : height - band, band : width - band] = False
-    usable = torch.ones_like(border) if views.transmittance is None else views.transmittance.cpu() >= 1
-    if views.counted is not None:
-        usable = usable & views.counted.cpu().all(0)
+    usable = torch.ones_like(border) if views.border_mask is None else views.border_mask.cpu() >= 1
+    if views.valid_mask is not None:
+        usable = usable & views.valid_mask.cpu().all(0)
     rows = border & usable if bool((border & usable).any()) else usable
     ground: Tensor = views.images.cpu()[:, :, rows].mean((0, 2)) if bool(rows.any()) else background
     return ground
