@@ -33,31 +33,31 @@ def behind(left=1.0, top=2.0, right=0.5, bottom=0.0):
 @pytest.mark.slow
 def test_a_border_is_found_as_it_is(scene):
     light = behind()
-    found = border_mask(scene.train.images * light)
+    found = find_border_mask(scene.train.images * light)
     assert bool((found[4:-4, 4:-4] == 1).all())
     torch.testing.assert_close(found, light, atol=0.4, rtol=0)  # at corners of a textured scene
     assert float((found - light).abs()[light < 1].mean()) < 0.05
 
-    assert border_mask(scene.train.images[:2] * light) is not None
+    assert find_border_mask(scene.train.images[:2] * light) is not None
 
 
 def test_a_border_of_changing_thickness_is_followed(scene):
     thickness = torch.linspace(2.0, 0.6, 192)  # of the upper side, as distortion leaves it
     light = (torch.arange(1, 145)[:, None] - thickness).clamp(0, 1)
-    found = border_mask(scene.train.images * light)
+    found = find_border_mask(scene.train.images * light)
     torch.testing.assert_close(found, light, atol=0.4, rtol=0)
     assert float((found - light).abs()[light < 1].mean()) < 0.1
 
 
 def test_the_scene_is_not_taken_for_a_border(scene):
     photos = scene.train.images.clone()
-    assert border_mask(photos) is None
-    assert border_mask(photos * behind(left=0, top=8.0, right=0)) is None  # too wide
+    assert find_border_mask(photos) is None
+    assert find_border_mask(photos * behind(left=0, top=8.0, right=0)) is None  # too wide
     assert border_mask(torch.rand(2, 3, 5, 5)) is None  # too small
-    assert border_mask(photos * behind() * 0.02) is None  # too dark to tell
+    assert find_border_mask(photos * behind() * 0.02) is None  # too dark to tell
     photos[0, :, :2] = 0.0  # in one photo alone
-    assert border_mask(photos) is None
-    assert border_mask(scene.train.images[:1] * behind()) is None  # one photo tells nothing
+    assert find_border_mask(photos) is None
+    assert find_border_mask(scene.train.images[:1] * behind()) is None  # one photo tells nothing
     assert border_mask(torch.zeros(3, 3, 144, 192)) is None
 
 
