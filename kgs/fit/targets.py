@@ -21,26 +21,26 @@ class Target(NamedTuple):
     camera: PinholeCamera
     image: Tensor  # (1, 3, H, W)
     moments: TargetMoments
-    clear: Tensor | None  # (1, 1, H, W), the share of the background in each pixel; None: 0 everywhere
+    background_weight: Tensor | None  # (1, 1, H, W), the share of the background in each pixel; None: 0 everywhere
     background: Tensor  # (3,), the background that `image` has
     gains: Tensor | None  # (3, 1, 1), the factors of the scene's colours in the photo; None: 1
-    border_mask: Tensor | None  # (H, W), that of a dark border, and 0 where no pixel counts; None: 1 everywhere
+    mask: Tensor | None  # (H, W), that of the dark border, and 0 where no pixel counts; None: 1 everywhere
 
-    def seen(self, render: Tensor) -> Tensor:
+    def as_photographed(self, render: Tensor) -> Tensor:
         """A render as the photo would show it: exposed, clamped to 1, behind its border, black where nothing counts."""
         exposed = render if self.gains is None else render * self.gains
         image: Tensor = _AtMostOne.apply(exposed)  # it is never below 0
-        return image if self.border_mask is None else image * self.border_mask
+        return image if self.mask is None else image * self.mask
 
-    def behind(self, background: Tensor | None) -> Tensor | None:
-        """What to render before, so that :meth:`seen` shows this background, `(3,)`: photos have it unexposed."""
+    def background_before_gain(self, background: Tensor | None) -> Tensor | None:
+        """The background to render with, so that :meth:`as_photographed` shows this one, `(3,)`: gains do not apply to it."""
         return background if self.gains is None or background is None else background / self.gains[:, 0, 0]
 
-    def over(self, background: Tensor, backend: str) -> Self:
-        """The view before another background, `(3,)`; the backend is that of the loss."""
-        if self.clear is None:
+    def over_background(self, background: Tensor, backend: str) -> Self:
+        """The view over another background, `(3,)`; the backend is that of the loss."""
+        if self.background_weight is None:
             return self
-        image = self.image + self.clear * (background - self.background)[:, None, None]
+        image = self.image + self.background_weight * (background - self.background)[:, None, None]
         return self._replace(image=image, moments=target_moments(image, backend=backend), background=background)
 
 
@@ -70,22 +70,22 @@ def targets(views: Views, background: Tensor, device: torch.device) -> list[Targ
     made = []
     for i, photo in enumerate(views.images):
         image = photo[None].to(device, torch.float32)
-        clear = None if views.alphas is None else 1.0 - views.alphas[i][None].to(image)
-        border_mask = None if views.border_mask is None else views.border_mask.to(image)
+        background_weight = None if views.alphas is None else 1.0 - views.alphas[i][None].to(image)
+        mask = None if views.border_mask is None else views.border_mask.to(image)
         if views.valid_mask is not None:
             valid = views.valid_mask[i].to(image)
             image = image * valid
-            clear = None if clear is None else clear * valid
-            border_mask = valid if border_mask is None else border_mask * valid
+            background_weight = None if background_weight is None else background_weight * valid
+            mask = valid if mask is None else mask * valid
         made.append(
             Target(
                 camera=move_camera(views.camera(i), device),
                 image=image,
                 moments=target_moments(image),
-                clear=clear,
+                background_weight=background_weight,
                 background=background.to(image),
                 gains=None if views.gains is None else views.gains[i, :, None, None].to(image),
-                border_mask=border_mask,
+                mask=mask,
             )
         )
     return made

@@ -305,11 +305,11 @@ class Trainer:
         background = self._background
         if config.training_background == "random":
             background = torch.rand(3, generator=state.colors, dtype=torch.float32, device=self.plan.device)
-            view = view.over(background, self.plan.backend)
-        rendering: Any = self.render_view(state.model(), camera, view.behind(background))
+            view = view.over_background(background, self.plan.backend)
+        rendering: Any = self.render_view(state.model(), camera, view.background_before_gain(background))
         if rendering.projected.means2d.requires_grad:
             rendering.projected.means2d.retain_grad()  # for the densifier
-        loss = self.loss_of(view.seen(rendering.image), view)
+        loss = self.loss_of(view.as_photographed(rendering.image), view)
         looks = state.step % self._look_every == 0 or state.step == steps or math.isnan(self._loss)
         if looks:
             self._loss = float(loss.detach())

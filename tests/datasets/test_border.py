@@ -81,7 +81,7 @@ def test_a_border_has_no_part_in_a_fit(scene):
     light = behind(left=2.0, top=2.0, right=0.0)
     target = targets(with_border(scene, light).train, torch.zeros(3), torch.device("cpu"))[0]
     render = torch.full_like(target.image, 0.5).requires_grad_()
-    photometric_loss(target.seen(render), target.image, 0.2, moments=target.moments).backward()
+    photometric_loss(target.as_photographed(render), target.image, 0.2, moments=target.moments).backward()
     assert bool((render.grad[0, :, light == 0] == 0).all())
     assert bool((render.grad[0, :, light == 1] != 0).any())
 

@@ -342,7 +342,7 @@ def test_no_keypoint_lies_where_no_pixel_counts(half: Views) -> None:
 def test_the_loss_has_no_gradient_where_no_pixel_counts(half: Views) -> None:
     for view, target in enumerate(targets(half, torch.zeros(3), torch.device("cpu"))):
         render = torch.full_like(target.image, 0.4).requires_grad_()
-        (gradient,) = torch.autograd.grad((target.seen(render) - target.image).square().sum(), render)
+        (gradient,) = torch.autograd.grad((target.as_photographed(render) - target.image).square().sum(), render)
         assert half.valid_mask is not None
         assert torch.equal(gradient[0].any(0), half.valid_mask[view])
 

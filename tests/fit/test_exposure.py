@@ -165,9 +165,9 @@ def test_what_is_seen_through_a_photo_has_no_exposure():
         gains = gain[:, 0, 0].repeat(len(images), 1)
         target = targets(replace(scene.train, images=images, alphas=alpha, gains=gains), behind, torch.device("cpu"))[0]
         for color in (behind, torch.tensor([0.1, 0.6, 0.3])):
-            view = target.over(color, "torch")
-            render = surface[:1] + (1 - alpha[:1]) * view.behind(color)[:, None, None]
-            torch.testing.assert_close(view.seen(render), view.image, atol=1e-6, rtol=0)
+            view = target.over_background(color, "torch")
+            render = surface[:1] + (1 - alpha[:1]) * view.background_before_gain(color)[:, None, None]
+            torch.testing.assert_close(view.as_photographed(render), view.image, atol=1e-6, rtol=0)
             torch.testing.assert_close(view.image, surface[:1] * gain + (1 - alpha[:1]) * color[:, None, None])
 
 
@@ -227,9 +227,9 @@ def test_a_background_that_shows_through_is_not_exposed_in_the_curve_and_in_pict
     assert comparable(trainer.state.curve[0]["train_psnr"]) > 80
     assert trainer.state.curve[0]["test_psnr"] < 40
     for view, target in enumerate(targets(scene.train, scene.background, torch.device("cpu"))):
-        own = GaussianRenderer()(see_through.model(), target.camera, target.behind(scene.background)).image
+        own = GaussianRenderer()(see_through.model(), target.camera, target.background_before_gain(scene.background)).image
         seen = scene.train.as_photo(view, scene.train.render(view, see_through.render))
-        torch.testing.assert_close(seen, target.seen(own).detach(), atol=1e-6, rtol=0)
+        torch.testing.assert_close(seen, target.as_photographed(own).detach(), atol=1e-6, rtol=0)
     with_metrics = replace(see_through, metrics=measure(see_through))
     for i, picture in enumerate(fit_page._pictures([scene.train], {"": with_metrics})):
         torch.testing.assert_close(picture.renders[""], scene.train.images[i], atol=1e-5, rtol=0)

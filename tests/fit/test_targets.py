@@ -11,7 +11,7 @@ def test_a_render_is_clamped_to_one_as_torch_clamps_it():
     values = torch.tensor([-0.5, 0.0, 1.0 - 2.0**-24, 1.0, 1.0 + 2.0**-23, 3.0])
     render = values.repeat(16).view(1, 3, 4, 8).requires_grad_()
     weights = torch.arange(96.0).view(1, 3, 4, 8)
-    seen, clamped = target.seen(render), render.clamp(max=1.0)
+    seen, clamped = target.as_photographed(render), render.clamp(max=1.0)
     assert torch.equal(seen, clamped)
     (found,) = torch.autograd.grad((seen * weights).sum(), render)
     (expected,) = torch.autograd.grad((clamped * weights).sum(), render)
