@@ -78,7 +78,7 @@ def load_scene(
         points: "none", or "model-points" for the points of a COLMAP model that at least two training views observe.
             Their positions were refined with the test views too.
         photos: False reads only the sizes of the photos: cameras, names and sizes are the same, `images` have no pixels
-            (they are on torch's "meta" device), `masks` and `finer` are None.
+            (they are on torch's "meta" device), `masks` and `train_full_size` are None.
         photo_folder: where a scene (LLFF, COLMAP) has its photos in several sizes, the name of the folder to take, as
             "images_8"; "": that of the largest, `images` first. See also :func:`kgs.datasets.field.field_size`.
         masks: a folder with masks of the photos, which have their stems; white is kept. None: those that the layout's
@@ -139,7 +139,7 @@ def load_scene(
             offset=offset,
             background=color,
             root=root,
-            finer=train_per_scale[1] if len(scales) > 1 else None,
+            train_full_size=train_per_scale[1] if len(scales) > 1 else None,
             notes=notes,
         )
 

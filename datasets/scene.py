@@ -219,7 +219,7 @@ class Scene:
         offset: `(3,)` float64, subtracted from the world's coordinates on loading; exports add it back.
         background: `(3,)`, the colour behind the scene, in [0, 1].
         root: the folder the scene was read from.
-        finer: the training views at a higher resolution, to find initial points in; None if `train` is as fine.
+        train_full_size: the training views at a higher resolution, to find initial points in; None if `train` is as fine.
         notes: what the files say that is not used, one sentence each, to be shown to the user.
     """
 
@@ -231,14 +231,14 @@ class Scene:
     offset: Tensor
     background: Tensor
     root: Path
-    finer: Views | None = None
+    train_full_size: Views | None = None
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.train) == 0:
             raise DataError(self.root, "train", "expected at least one training view, got none")
-        if self.finer is not None and self.finer.names != self.train.names:
-            raise ValueError(f"finer: expected the views {self.train.names} as train, got {self.finer.names}")
+        if self.train_full_size is not None and self.train_full_size.names != self.train.names:
+            raise ValueError(f"train_full_size: expected the views {self.train.names} as train, got {self.train_full_size.names}")
         shapes = tuple(self.points.shape), tuple(self.point_colors.shape)
         if shapes[0] != shapes[1] or len(shapes[0]) != 2 or shapes[0][1] != 3:
             raise ValueError(f"points, point_colors: expected two of shape (P, 3), got {shapes[0]} and {shapes[1]}")

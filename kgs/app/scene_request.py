@@ -70,7 +70,7 @@ class SceneRequest:
         """The title of the page: as asked for, else the name of the folder in plain words."""
         return self.title or in_plain_words((base / self.scene).resolve().name)
 
-    def finer_side(self, scene: Scene) -> int | None:
+    def full_side(self, scene: Scene) -> int | None:
         """The longer side in pixels with `--detail high`; None where the photos of the fit are about as large."""
         side = max(scene.train.images.shape[-2:])
         largest = min(DETAILS["high"].size, round(side * (self.downscale or 1.0)))

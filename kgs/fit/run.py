@@ -63,7 +63,7 @@ def choose_points(scene: Scene, config: FitConfig, bar: ProgressBar = silent) ->
             raise DataError(scene.root, "points", reason)
         check_in_view(scene.points, scene.train, scene.root)
         return InitialPoints(scene.points, scene.point_colors, scene.init_kind)
-    views = scene.train if scene.finer is None else scene.finer
+    views = scene.train if scene.train_full_size is None else scene.train_full_size
     options: dict[str, Any] = {
         "seed": config.seed,
         "count": config.init_points,

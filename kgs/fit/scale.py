@@ -59,7 +59,7 @@ def _scaled_scene(scene: Scene, factor: float) -> Scene:
         scene,
         train=_scaled_views(scene.train, factor),
         test=_scaled_views(scene.test, factor),
-        finer=None if scene.finer is None else _scaled_views(scene.finer, factor),
+        train_full_size=None if scene.train_full_size is None else _scaled_views(scene.train_full_size, factor),
         points=scene.points * factor,
         offset=scene.offset * factor,
     )

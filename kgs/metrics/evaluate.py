@@ -102,7 +102,7 @@ class Through(NamedTuple):
 
 
 def recolored(
-    image: Tensor, shown: Tensor, photo: Tensor, counted: Tensor | None = None, through: Through | None = None
+    image: Tensor, shown: Tensor, photo: Tensor, valid: Tensor | None = None, through: Through | None = None
 ) -> Tensor:
     """A render `(1, 3, H, W)` with the gain and offset of each channel that fit `shown` to the photo `(3, H, W)`.
 

@@ -163,8 +163,8 @@ def from_the_middle(scene: Scene, count: int) -> Scene:
     middle = sorted(order[:count])
     train = with_border(views.select(middle))  # that of all photos would depend on those held out
     test = replace(views.select(sorted(order[len(order) - held_out :])), border_mask=train.border_mask)
-    finer = None if scene.finer is None else with_border(scene.finer.select(middle))
-    return replace(scene, train=train, test=test, finer=finer)
+    full_size = None if scene.train_full_size is None else with_border(scene.train_full_size.select(middle))
+    return replace(scene, train=train, test=test, train_full_size=full_size)
 
 
 @lru_cache(maxsize=1)

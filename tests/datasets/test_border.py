@@ -138,8 +138,8 @@ def test_pixels_of_the_border_are_not_usable(scene):
 def test_a_scene_is_loaded_with_its_border(kgs_data):
     loaded = load_scene(kgs_data / "nerfstudio" / "fox", 3, 2)
     assert loaded.train.border_mask is not None
-    assert loaded.finer is not None
-    assert loaded.finer.border_mask is not None
+    assert loaded.train_full_size is not None
+    assert loaded.train_full_size.border_mask is not None
     assert torch.equal(loaded.test.border_mask, loaded.train.border_mask)
     assert 0.4 < float(loaded.train.border_mask[120, 0]) < 0.6  # half a pixel of black on the left
     assert bool((loaded.train.border_mask[3:-3, 3:-3] == 1).all())

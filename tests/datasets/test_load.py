@@ -190,10 +190,10 @@ def test_first_points_have_the_training_views_in_more_pixels(
     monkeypatch.setattr("kgs.datasets.load._FINE_PIXELS", fine_pixels)
     posed_photos(tmp_path)
     scene = load_scene(tmp_path, downscale=downscale)
-    assert (scene.finer and tuple(scene.finer.images.shape[-2:])) == finer
-    if scene.finer is not None:
-        assert scene.finer.names == scene.train.names
-        assert torch.equal(scene.finer.cameras.extrinsics, scene.train.cameras.extrinsics)
+    assert (scene.train_full_size and tuple(scene.train_full_size.images.shape[-2:])) == finer
+    if scene.train_full_size is not None:
+        assert scene.train_full_size.names == scene.train.names
+        assert torch.equal(scene.train_full_size.cameras.extrinsics, scene.train.cameras.extrinsics)
 
 
 @pytest.mark.parametrize(

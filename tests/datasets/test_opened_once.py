@@ -65,7 +65,7 @@ def test_a_scene(
     opened.clear()
     scene = load_scene(tmp_path, downscale=downscale, photos=photos)
     count = len(scene.train) + len(scene.test)
-    assert (scene.finer is not None) == (photos and downscale is not None)
+    assert (scene.train_full_size is not None) == (photos and downscale is not None)
     assert [times for name, times in opened.items() if name.endswith(".png")] == [1] * count
     assert len(decoded) == (count if photos else 0)
 

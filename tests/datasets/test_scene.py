@@ -125,7 +125,7 @@ def test_synthetic_scenes_are_float32_on_the_cpu_whatever_the_defaults():
 
 
 def check_float32(scene):
-    for part in (scene.train, scene.test, scene.train.halved(), *([scene.finer] if scene.finer else [])):
+    for part in (scene.train, scene.test, scene.train.halved(), *([scene.train_full_size] if scene.train_full_size else [])):
         tensors = [part.images, part.cameras.intrinsics, part.cameras.extrinsics, part.cameras.height, part.cameras.fx]
         tensors += [part.camera([0]).width] + ([] if part.masks is None else [part.masks])
         assert {(tensor.dtype, tensor.device.type) for tensor in tensors} == {(torch.float32, "cpu")}
@@ -153,4 +153,4 @@ def test_cameras_without_decoding_photos(tmp_path, monkeypatch, write, downscale
         assert last.names == full.names[-1:]
         assert torch.equal(last.cameras.extrinsics, full.cameras.extrinsics[-1:])
     assert torch.equal(bare.offset, whole.offset)
-    assert bare.finer is None
+    assert bare.train_full_size is None

@@ -56,7 +56,7 @@ def test_points_of_the_files_are_multiplied_with_the_splat(fit: Fit) -> None:
         (camera_centers(fit.scene.train.cameras.extrinsics), camera_centers(large.scene.train.cameras.extrinsics)),
     ):
         torch.testing.assert_close(after + large.scene.offset, 3 * (before + fit.scene.offset), rtol=1e-5, atol=1e-5)
-    torch.testing.assert_close(large.scene.finer.cameras.extrinsics, large.scene.train.cameras.extrinsics)
+    torch.testing.assert_close(large.scene.train_full_size.cameras.extrinsics, large.scene.train.cameras.extrinsics)
     assert fit.options.near_plane * 3 == large.options.near_plane
 
 

@@ -92,7 +92,7 @@ def _read_ply(folder: Path) -> None:
 
 def check_scene(scene: Scene) -> None:
     """Raise Unsound where a scene holds numbers that are not finite or not valid."""
-    for views in filter(None, (scene.train, scene.test, scene.finer)):
+    for views in filter(None, (scene.train, scene.test, scene.train_full_size)):
         _check_views(views)
     check_range("points", scene.points)
     check_range("point_colors", scene.point_colors, 0, 1)

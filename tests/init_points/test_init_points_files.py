@@ -79,7 +79,7 @@ def test_views_that_show_no_initial_point_are_named(scene: Scene, tmp_path: Path
     extrinsics[1, :3] = torch.diag(torch.tensor([-1.0, 1.0, -1.0])) @ extrinsics[1, :3]  # turned about
     turned = replace(scene.train, cameras=with_camera(scene.train.cameras, extrinsics))
     with pytest.warns(UserWarning, match=f"none lies in the image of {scene.train.names[1]}$"):
-        choose_points(replace(scene, train=turned, finer=None), config)
+        choose_points(replace(scene, train=turned, train_full_size=None), config)
 
 
 def test_the_origin_is_subtracted_before_rounding(tmp_path: Path) -> None:

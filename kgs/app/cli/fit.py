@@ -174,11 +174,11 @@ def fit(
     if published.signal:
         say_next("the same command with --resume goes on where it stopped")
         return 128 + published.signal
-    finer = request.finer_side(loaded) if is_free and preset == "auto" else None
-    more = f"the same command with --detail high fits {finer} pixels instead of {max(height, width)}, and takes longer"
+    full_side = request.full_side(loaded) if is_free and preset == "auto" else None
+    more = f"the same command with --detail high fits {full_side} pixels instead of {max(height, width)}, and takes longer"
     say_next(
         f"open {as_line(out / 'index.html')} in a browser: the splat to look around in, and how good it is",
-        *([more] if finer else []),
+        *([more] if full_side else []),
         f"{as_line('kgs', 'render', splat, '--cameras', posed, '-o', renders, *shrunk)}  # pictures from every camera",
         f"{as_line('kgs', 'eval', out, '--lpips-weights', 'WEIGHTS')}  # measure again, with LPIPS",
         VIEWER.format(as_line(splat)),

@@ -306,10 +306,10 @@ def _poses_note(metrics: Mapping[str, Any]) -> list[str]:
 
 def _finer_note(scene: Scene, request: SceneRequest) -> list[str]:
     """That a larger fit of the same photos is possible, as a sentence; [] if it is not."""
-    finer = request.finer_side(scene)
+    full_side = request.full_side(scene)
     side = max(scene.train.images.shape[-2:])
-    words = f"The photos were fitted with {side} pixels on their longer side; kgs fit --detail high takes {finer}."
-    return [words] if finer else []
+    words = f"The photos were fitted with {side} pixels on their longer side; kgs fit --detail high takes {full_side}."
+    return [words] if full_side else []
 
 
 def _all_cameras(*parts: Views) -> PinholeCamera:
