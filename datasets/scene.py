@@ -187,23 +187,26 @@ class Views:
         parts += [] if self.valid_mask is None else [self.valid_mask]
         return torch.stack(parts).all(dim=0) if parts else None
 
-    def halved(self) -> Self:
-        """The views at half the width and height: means of 2 x 2 pixels; an odd last row or column is left out.
+    def downsample(self, factor: int) -> Self:
+        """The views at 1 / factor of the width and height: means of factor x factor pixels; what is left over is cut.
 
-        Images of a single row or column are a ValueError.
+        Images with fewer rows or columns than that are a ValueError.
         """
-        size = self.images.shape[-2] // 2, self.images.shape[-1] // 2
+        size = self.images.shape[-2] // factor, self.images.shape[-1] // factor
         if 0 in size:
-            raise ValueError(f"images: expected 2 x 2 pixels or more to halve, got {tuple(self.images.shape[-2:])}")
+            given = tuple(self.images.shape[-2:])
+            raise ValueError(f"images: expected at least {factor} x {factor} pixels to downsample, got {given}")
         intrinsics = self.cameras.intrinsics.clone()
-        intrinsics[:, :2, :3] *= 0.5
-        intrinsics[:, :2, 2] -= 0.25  # (c + 1/2) / 2 - 1/2: pixel centres are integers
-        cameras = pinholes(intrinsics, self.cameras.extrinsics, size)
-        alphas = None if self.alphas is None else avg_pool2d(self.alphas, 2)
-        border_mask = None if self.border_mask is None else avg_pool2d(self.border_mask[None], 2)[0]
-        valid_mask = None if self.valid_mask is None else avg_pool2d(self.valid_mask.float(), 2) == 1
-        images = avg_pool2d(self.images, 2)
-        return replace(self, cameras=cameras, images=images, alphas=alphas, border_mask=border_mask, valid_mask=valid_mask)
+        intrinsics[:, :2, :3] /= factor
+        intrinsics[:, :2, 2] += 0.5 / factor - 0.5  # (c + 1/2) / factor - 1/2: pixel centres are integers
+        return replace(
+            self,
+            cameras=pinholes(intrinsics, self.cameras.extrinsics, size),
+            images=avg_pool2d(self.images, factor),
+            alphas=None if self.alphas is None else avg_pool2d(self.alphas, factor),
+            border_mask=None if self.border_mask is None else avg_pool2d(self.border_mask[None], factor)[0],
+            valid_mask=None if self.valid_mask is None else avg_pool2d(self.valid_mask.float(), factor) == 1,
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -106,8 +106,8 @@ class Trainer:
         ).train()
         self.scene = scene if state.poses is None else place_cameras(scene, state.poses.extrinsics)
         self._views = targets(scene.train, scene.background, self.plan.device)
-        self._halved = (
-            targets(scene.train.halved(), scene.background, self.plan.device) if self.plan.schedule.coarse else []
+        self._half_size = (
+            targets(scene.train.downsample(2), scene.background, self.plan.device) if self.plan.schedule.coarse else []
         )
 
     @property
@@ -300,7 +300,7 @@ class Trainer:
         progress = state.step / steps
         self._set_progress(progress)
         index = self._next_view()
-        view = (self._halved if state.step <= self.plan.schedule.coarse else self._views)[index]
+        view = (self._half_size if state.step <= self.plan.schedule.coarse else self._views)[index]
         camera = view.camera if state.poses is None else state.poses.camera(view.camera, index)
         background = self._background
         if config.training_background == "random":

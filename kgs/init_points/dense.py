@@ -92,12 +92,12 @@ def dense_points(
 def small_enough(views: Views, near: float, far: float) -> Views:
     """The views, halved until a sweep takes not too long, and its planes are at most two pixels apart."""
     while views.images[0, 0].numel() > MOST_PIXELS or views.images[:, 0].numel() > MOST_PIXELS_OF_ALL:
-        views = views.halved()
+        views = views.downsample(2)
     while min(views.images.shape[-2:]) >= 2 * SMALLEST:
         shift = planes_wanted(views, near, far)
         if shift <= MOST_SHIFT and views.images[:, 0].numel() * plane_count(shift) <= MOST_SAMPLES:
             break
-        views = views.halved()
+        views = views.downsample(2)
     return views
 
 

@@ -117,7 +117,7 @@ def test_halving_and_choosing_keep_the_border(scene):
     light = behind(left=2.0, top=1.0, right=0.0)
     views = with_border(scene, light).train
     assert views.select([1]).border_mask is light
-    halved = views.halved().border_mask
+    halved = views.downsample(2).border_mask
     assert float(halved[20, 0]) == 0.0
     assert float(halved[0, 20]) == 0.5
 

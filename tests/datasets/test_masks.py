@@ -237,7 +237,7 @@ def test_a_mask_is_reduced_with_its_photo(tmp_path: Path) -> None:
     assert views.valid_mask is not None
     assert (~views.valid_mask).nonzero().tolist() == [[1, 2, 3]]  # a pixel that a mask covers in part does not count
     again = load_scene(tmp_path, hold_out=0).train
-    halved = again.halved()
+    halved = again.downsample(2)
     assert halved.valid_mask is not None
     assert torch.equal(halved.valid_mask, views.valid_mask)
     chosen = again.select([1])

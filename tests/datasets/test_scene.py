@@ -27,7 +27,7 @@ def views(height, width):
 @pytest.mark.parametrize("size", [(16, 20), (15, 21)])
 def test_a_point_projects_to_the_same_place_of_a_halved_picture(size):
     full = views(*size)
-    half = full.halved()
+    half = full.downsample(2)
     assert half.images.shape == (2, 3, size[0] // 2, size[1] // 2)
     assert half.masks.shape == (2, 1, size[0] // 2, size[1] // 2)
     points = torch.tensor([[[0.1, -0.2, 3.0]], [[-0.3, 0.1, 2.0]]])
@@ -40,7 +40,7 @@ def test_a_point_projects_to_the_same_place_of_a_halved_picture(size):
 
 def test_a_single_row_cannot_be_halved():
     with pytest.raises(ValueError, match="2 x 2"):
-        views(1, 8).halved()
+        views(1, 8).downsample(2)
 
 
 def test_views_are_a_data_set_of_dicts():
@@ -125,7 +125,7 @@ def test_synthetic_scenes_are_float32_on_the_cpu_whatever_the_defaults():
 
 
 def check_float32(scene):
-    for part in (scene.train, scene.test, scene.train.halved(), *([scene.train_full_size] if scene.train_full_size else [])):
+    for part in (scene.train, scene.test, scene.train.downsample(2), *([scene.train_full_size] if scene.train_full_size else [])):
         tensors = [part.images, part.cameras.intrinsics, part.cameras.extrinsics, part.cameras.height, part.cameras.fx]
         tensors += [part.camera([0]).width] + ([] if part.masks is None else [part.masks])
         assert {(tensor.dtype, tensor.device.type) for tensor in tensors} == {(torch.float32, "cpu")}

@@ -72,7 +72,7 @@ def test_sift_colors_are_those_of_the_planes(sift_points: InitialPoints) -> None
 
 def test_the_same_bits_again_for_any_number_of_threads(planes: Views) -> None:
     count = cv2.getNumThreads()
-    small = planes.halved()
+    small = planes.downsample(2)
 
     def again() -> tuple[torch.Tensor, torch.Tensor]:
         threads = torch.get_num_threads()
@@ -172,7 +172,7 @@ def test_random_points_where_no_two_views_see_the_same(count: int) -> None:
 
 @pytest.mark.slow
 def test_each_stage_says_how_far_it_is(planes: Views, capsys: pytest.CaptureFixture[str]) -> None:
-    small = planes.halved()
+    small = planes.downsample(2)
     initial_points(small, "dense")
     assert capsys.readouterr() == ("", "")  # nothing unless asked for
     initial_points(small, "dense", bar=each)

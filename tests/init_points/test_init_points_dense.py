@@ -174,7 +174,7 @@ def test_smoothing_is_the_same_in_all_directions(tilt: float) -> None:
 
 
 def test_depths_do_not_depend_on_the_unit(views: Views, span: tuple[float, float]) -> None:
-    views = views.halved()
+    views = views.downsample(2)
     small = views.cameras.extrinsics.clone()
     small[:, :3, 3] *= 1e-3
     cameras = PinholeCamera(views.cameras.intrinsics, small, views.cameras.height, views.cameras.width)
@@ -212,7 +212,7 @@ def test_few_points_are_enough_where_many_agree(draw: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [50, pytest.param(200, marks=pytest.mark.slow)])
 def test_a_spread_draw_has_one_point_in_each_cell(views: Views, span: tuple[float, float], count: int) -> None:
-    views = views.halved()
+    views = views.downsample(2)
     spread, *_ = dense_points(views, *span, count, generator(), draw="spread")
     uniform, *_ = dense_points(views, *span, count, generator(), draw="uniform")
     assert 0.9 * count <= len(spread) <= count
@@ -240,7 +240,7 @@ def test_the_first_of_each_cell_is_that_of_numpy() -> None:
 
 @pytest.mark.slow
 def test_a_draw_of_more_than_there_is_takes_all(views: Views, span: tuple[float, float]) -> None:
-    every = [dense_points(views.halved(), *span, 10**6, generator(), draw=draw)[0] for draw in ("spread", "uniform")]
+    every = [dense_points(views.downsample(2), *span, 10**6, generator(), draw=draw)[0] for draw in ("spread", "uniform")]
     assert len(every[0]) == len(every[1])
     assert torch.equal(every[0].sort(0).values, every[1].sort(0).values)
 
@@ -273,7 +273,7 @@ def test_points_of_the_sky_are_as_good_as_infinitely_far_away(before_a_sky) -> N
 
 @pytest.mark.slow
 def test_where_there_is_no_sky_no_point_is_far_away(views: Views, span) -> None:
-    small = views.halved()
+    small = views.downsample(2)
     for found in sweep_depths(small, *span):
         assert float(found.depths.max()) <= 1.001 * FARTHEST * span[1]
         assert float(found.depths.min()) > 0

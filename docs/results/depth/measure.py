@@ -92,7 +92,7 @@ def _known(data: Path, name: str, size: str, folder: Path | None) -> Truth:
     if path is not None and path.is_file():
         return Truth(views, near, far, torch.load(path))
     while everything.images.shape[-1] > views.images.shape[-1]:
-        everything = everything.halved()
+        everything = everything.downsample(2)
     depths = confirmed_depths(everything, near, far, [everything.names.index(name) for name in views.names])
     if path is not None:
         torch.save(depths, path)
