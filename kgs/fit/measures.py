@@ -7,7 +7,7 @@ from torch import Tensor
 
 from kgs.machine import peak_rss_mb, versions
 from kgs.metrics.coverage import Coverage
-from kgs.metrics.evaluate import evaluate, views_to_recolor
+from kgs.metrics.evaluate import evaluate, views_to_correct
 from kgs.metrics.lpips import Lpips
 
 from .fit import Fit
@@ -19,7 +19,7 @@ _INIT_NOTES = {
     "file": "initial points of a file",
 }
 _CONVENTIONS = {
-    "recolored": "test views, each channel of a render with the gain and offset that fit its photo best",
+    "color_corrected": "test views, each channel of a render with the gain and offset that fit its photo best",
     "ssim": "Kornia, 11 x 11, reflect padded; ssim_zero_padded as the published tables",
     "lpips": "VGG16 v0.1, inputs in [-1, 1]; lpips_vgg_unscaled with inputs in [0, 1] as the published tables",
     "test_views_used_for": "metrics and the curve only; no early stopping",
@@ -46,7 +46,7 @@ def measure(fit: Fit, lpips: Lpips | None = None, look: Callable[[int, Tensor], 
 
     Returns:
         The content of metrics.json as plain values; None stands for what was not measured. Where the training photos
-        differ in exposure, "recolored" has the measures of test views after an affine fit of their colours.
+        differ in exposure, "color_corrected" has the measures of test views after an affine fit of their colours.
 
     Raises:
         ValueError: the fit has no settings, or no history, as one that was read from its folder.
@@ -73,12 +73,12 @@ def measure(fit: Fit, lpips: Lpips | None = None, look: Callable[[int, Tensor], 
         if look is not None:
             look(view, image)
 
-    recolored = {}
+    color_corrected = {}
     if scene.train.gains is not None and len(scene.test):
-        recolored["recolored"] = evaluate(fit.render, views_to_recolor(scene), lpips, recolor=True)
+        color_corrected["color_corrected"] = evaluate(fit.render, views_to_correct(scene), lpips, correct_color=True)
     return {
         "test": evaluate(fit.render, scene.test, lpips, look=look_at) if len(scene.test) else None,
-        **recolored,
+        **color_corrected,
         "train": evaluate(fit.render, scene.train, lpips),
         "seen": coverage.means(),
         **fit.history,

@@ -36,7 +36,7 @@ def evaluate(
     views: Views,
     lpips: Lpips | None = None,
     *,
-    recolor: bool = False,
+    correct_color: bool = False,
     look: Callable[[int, Tensor], None] | None = None,
 ) -> dict[str, Any]:
     """Render each view from its camera, to `(1, 3, H, W)`, and compare it with its photo; no gradients are kept.
@@ -78,7 +78,7 @@ def evaluate(
                 through = Through(render(views.camera(index), torch.zeros(3)), views.alphas[index].to(image))
                 if views.border_mask is not None:  # the border darkens the background, too
                     valid = (views.border_mask >= 1) & (True if valid is None else valid)
-            shown, _, _ = views.compared(index, recolored(image, shown, photo, valid, through))
+            shown, _, _ = views.compared(index, color_corrected(image, shown, photo, valid, through))
         shares.append(share)
         rows.append(_measure(shown, photo[None], share, lpips))
     columns = {key: [row[key] for row in rows] for key in MEASURES}
@@ -88,7 +88,7 @@ def evaluate(
     return {**means, "views": [{"name": name, **row} for name, row in zip(views.names, rows, strict=True)]}
 
 
-def views_to_recolor(scene: Scene) -> Views:
+def views_to_correct(scene: Scene) -> Views:
     """The test views for `recolor`: where the training views have gains, with gains of 1, as `render` takes gains."""
     views = scene.test
     return views if scene.train.gains is None else replace(views, gains=torch.ones(len(views), 3))
@@ -101,7 +101,7 @@ class Through(NamedTuple):
     alpha: Tensor  # (1, H, W), the share of the scene in each pixel of the photo
 
 
-def recolored(
+def color_corrected(
     image: Tensor, shown: Tensor, photo: Tensor, valid: Tensor | None = None, through: Through | None = None
 ) -> Tensor:
     """A render `(1, 3, H, W)` with the gain and offset of each channel that fit `shown` to the photo `(3, H, W)`.
@@ -156,8 +156,8 @@ def measure_again(
     """
     fresh: dict[str, Any] = {}
     parts = [("test", scene.test), ("train", scene.train)]
-    if metrics.get("recolored"):
-        parts.append(("recolored", views_to_recolor(scene)))
+    if metrics.get("color_corrected"):
+        parts.append(("color_corrected", views_to_correct(scene)))
     for part, views in parts:
         old = metrics.get(part) or {"views": []}
         try:
@@ -166,7 +166,7 @@ def measure_again(
             raise DataError(path, part, "expected the metrics of a fit, got something else") from error
         if set(old_rows) != set(views.names):
             raise DataError(path, part, f"has other views than the {len(views)} of {scene.root}: fit again")
-        new = evaluate(render, views, lpips, recolor=part == "recolored") if old_rows else None
+        new = evaluate(render, views, lpips, correct_color=part == "color_corrected") if old_rows else None
         if new is not None and lpips is None:
             _copy_lpips(old, new)
             for row in new["views"]:
@@ -202,13 +202,13 @@ def as_text(metrics: dict[str, Any]) -> str:
     """The metrics of a fit as lines of text."""
     lines = list[str]()
     names = {"psnr": "PSNR", "ssim": "SSIM", "ssim_zero_padded": "SSIM (zero padded)", "lpips_vgg": "LPIPS"}
-    for part in ("test", "recolored", "train"):
+    for part in ("test", "color_corrected", "train"):
         values = metrics.get(part) or {}
         measured = [f"{title} {values[key]:.4g}" for key, title in names.items() if values.get(key) is not None]
         if measured:
             share = values.get("valid")
             where = "" if share is None else f" (of {share:.0%} of the pixels: masks leave out the rest)"
-            adjusted = ", each render in the colours that fit its photo best" if part == "recolored" else ""
+            adjusted = ", each render in the colours that fit its photo best" if part == "color_corrected" else ""
             lines.append(f"{'test' if adjusted else part:>5}: {', '.join(measured)}{where}{adjusted}")
     coverage = metrics.get("seen") or {}
     level = coverage.get("psnr")

@@ -117,11 +117,11 @@ def test_lpips_that_is_not_measured_again_is_kept():
     render = renderer_of(distort(views.images).clamp(0, 1))
     torch.manual_seed(0)
     lpips = Lpips()
-    measured = [evaluate(render, views, lpips, recolor=recolor) for recolor in (False, True)]
-    metrics = {"test": measured[0], "train": measured[0], "recolored": measured[1], "steps": 3}
+    measured = [evaluate(render, views, lpips, correct_color=recolor) for recolor in (False, True)]
+    metrics = {"test": measured[0], "train": measured[0], "color_corrected": measured[1], "steps": 3}
     assert measure_again(Path("metrics.json"), metrics, scene, render, None) == metrics
-    wrong = {**metrics, "recolored": {"views": []}}
-    with pytest.raises(DataError, match="recolored"):
+    wrong = {**metrics, "color_corrected": {"views": []}}
+    with pytest.raises(DataError, match="color_corrected"):
         measure_again(Path("metrics.json"), wrong, scene, render, None)
 
 
@@ -129,10 +129,10 @@ def test_masked_views_without_gains_are_recoloured_for_a_render_that_takes_a_cam
     views = random_views()
     masked = replace(views, alphas=torch.full_like(views.images[:, :1], 0.5))
     render = renderer_of(distort(views.images))
-    assert evaluate(render, masked, recolor=True) == evaluate(render, views, recolor=True)
+    assert evaluate(render, masked, correct_color=True) == evaluate(render, views, correct_color=True)
     none = torch.zeros(0, 3)
     scene = Scene(masked, masked, none, none, "none", torch.zeros(3), torch.zeros(3), Path("scene"))
-    metrics = {part: evaluate(render, masked, recolor=part == "recolored") for part in ("test", "train", "recolored")}
+    metrics = {part: evaluate(render, masked, correct_color=part == "color_corrected") for part in ("test", "train", "color_corrected")}
     assert measure_again(Path("metrics.json"), metrics, scene, render, None) == metrics
 
 

@@ -21,7 +21,7 @@ from kgs.fit.targets import targets
 from kgs.fit.trainer import Trainer
 from kgs.init_points import InitialPoints, initial_points
 from kgs.init_points.patches import MIN_PATCHES, PatchColors
-from kgs.metrics.evaluate import comparable, evaluate, measure_again, recolored
+from kgs.metrics.evaluate import comparable, evaluate, measure_again, color_corrected
 
 GAINS = torch.tensor([[0.5, 0.5, 0.5], [0.8, 0.8, 0.8], [1.25, 1.25, 1.25], [1.1, 1.0, 0.8]])
 
@@ -108,7 +108,7 @@ def test_a_fit_of_photos_that_differ_is_as_good_as_of_photos_that_do_not(arc, ex
     torch.testing.assert_close(fit.scene.train.gains, truth, rtol=0.05, atol=0.0)
     same = fit_scene(exposed, replace(CONFIG, exposure="same"))
     assert same.scene.train.gains is None
-    levels = [evaluate(f.render, arc.test, recolor=True)["psnr"] for f in (fit, same, fit_scene(arc, CONFIG))]
+    levels = [evaluate(f.render, arc.test, correct_color=True)["psnr"] for f in (fit, same, fit_scene(arc, CONFIG))]
     assert levels[0] > levels[2] - 1.0
     assert levels[0] > levels[1] + 2.0
 
@@ -116,7 +116,7 @@ def test_a_fit_of_photos_that_differ_is_as_good_as_of_photos_that_do_not(arc, ex
 def test_training_views_are_compared_as_they_were_exposed_and_both_measures_are_named(fit):
     metrics = measure(fit)
     assert metrics["train"]["psnr"] > metrics["test"]["psnr"]
-    assert metrics["recolored"]["psnr"] > metrics["test"]["psnr"] + 1.0
+    assert metrics["color_corrected"]["psnr"] > metrics["test"]["psnr"] + 1.0
     assert metrics["decisions"]["exposure"]["n"] >= MIN_PATCHES
 
 
@@ -210,7 +210,7 @@ def test_a_background_that_shows_through_is_not_exposed_in_any_measure(see_throu
     metrics = measure(see_through)
     assert comparable(metrics["train"]["psnr"]) > 80
     assert metrics["test"]["psnr"] < 40
-    assert comparable(metrics["recolored"]["psnr"]) > 60, "the colours of the scene alone are fitted"
+    assert comparable(metrics["color_corrected"]["psnr"]) > 60, "the colours of the scene alone are fitted"
     again = measure_again(Path("metrics.json"), metrics, scene, see_through.render, None)
     assert again["train"] == metrics["train"]
 
@@ -240,13 +240,13 @@ def test_recoloured_renders_fit_best():
     draw = torch.Generator().manual_seed(0)
     image = torch.rand(1, 3, 5, 7, generator=draw)
     photo = torch.rand(3, 5, 7, generator=draw)
-    found = recolored(image, image, photo)
+    found = color_corrected(image, image, photo)
     for k in range(3):
         columns = np.stack([image[0, k].flatten().numpy(), np.ones(35)], 1)
         best = columns @ np.linalg.lstsq(columns, photo[k].flatten().numpy(), rcond=None)[0]
         np.testing.assert_allclose(found[0, k].flatten().numpy(), best, atol=1e-5)
     flat = torch.full((1, 3, 5, 7), 0.25)
-    torch.testing.assert_close(recolored(flat, flat, photo)[0].mean((1, 2)), photo.mean((1, 2)))
+    torch.testing.assert_close(color_corrected(flat, flat, photo)[0].mean((1, 2)), photo.mean((1, 2)))
 
 
 def test_only_what_counts_is_recoloured_by():
@@ -256,7 +256,7 @@ def test_only_what_counts_is_recoloured_by():
     counted = torch.zeros(1, 5, 8, dtype=torch.bool)
     counted[..., 4:] = True
     photo = (0.6 * image[0] + 0.2) * counted
-    found = recolored(image, image * counted, photo, counted)
+    found = color_corrected(image, image * counted, photo, counted)
     torch.testing.assert_close(found, 0.6 * image + 0.2)
 
 
