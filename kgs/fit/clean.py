@@ -18,7 +18,7 @@ from torch import Tensor
 
 from kgs.camera import move_camera
 from kgs.geometry import NEIGHBOURS, camera_centers, log_spacing, nearest_pixels, project_points, typical_depths
-from kgs.metrics.evaluate import comparable
+from kgs.metrics.evaluate import clipped_psnr
 from kgs.model import GaussianModel
 from kgs.progress import ProgressBar, silent
 from kgs.renderer import GaussianRenderer
@@ -282,6 +282,6 @@ def _changes(fit: Fit, rows: Tensor, bar: ProgressBar) -> Tensor:
             image.backward(signs)
             if factors.grad is not None:
                 squares += factors.grad.square()
-        error = 10.0 ** (-0.1 * comparable(fit.psnr(views.select([i]))))
+        error = 10.0 ** (-0.1 * clipped_psnr(fit.psnr(views.select([i]))))
         changes = torch.maximum(changes, squares / (_SIGNS * error))
     return changes[rows]

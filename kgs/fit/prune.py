@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kgs.camera import move_camera
 from kgs.datasets.scene import Views
-from kgs.metrics.evaluate import comparable
+from kgs.metrics.evaluate import clipped_psnr
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 from kgs.types import RasterOptions
@@ -84,7 +84,7 @@ def training_levels(fit: Fit) -> list[float]:
 
 def _levels(fit: Fit) -> Iterator[float]:
     views = fit.scene.train
-    return (comparable(fit.psnr(views.select([i]))) for i in range(len(views)))
+    return (clipped_psnr(fit.psnr(views.select([i]))) for i in range(len(views)))
 
 
 def contributions(model: GaussianModel, views: Views, options: RasterOptions, backend: str = "auto") -> Tensor:

@@ -132,18 +132,18 @@ def mean_psnr(render: Callable[..., Tensor], views: Views) -> float | None:
     values = list[float]()
     for i in range(len(views)):
         image, photo, share = views.compared(i, views.render(i, render)[0].cpu())
-        values.append(float(psnr(image, photo, 1.0)) + decibels(share))
+        values.append(masked_psnr(image, photo, share))
     mean = sum(values) / len(values) if values else math.inf  # a render that equals its photo has no finite PSNR
     return round(mean, 4) if math.isfinite(mean) else None
 
 
-def decibels(share: float) -> float:
-    """What is added to a PSNR over all pixels to get that of the share of them that counts; the others are equal."""
-    return 10 * math.log10(share) if share else math.inf
+def masked_psnr(image: Tensor, photo: Tensor, share: float) -> float:
+    """PSNR in dB over the share of the pixels that count; the others are equal in both images."""
+    return float(psnr(image, photo, 1.0)) + 10 * math.log10(share) if share else math.inf
 
 
-def comparable(level: float | None) -> float:
-    """A PSNR in dB for comparisons: one that is infinite (None), or above `BEST`, counts as `BEST`."""
+def clipped_psnr(level: float | None) -> float:
+    """A PSNR in dB, at most `BEST`; None, an infinite one, is `BEST`."""
     return BEST if level is None else min(level, BEST)
 
 
@@ -184,7 +184,7 @@ def _copy_lpips(source: dict[str, Any], target: dict[str, Any]) -> None:
 
 def _measure(image: Tensor, target: Tensor, share: float, lpips: Lpips | None) -> dict[str, float | None]:
     """The `MEASURES` of one image, of whose pixels a share counts."""
-    level = psnr(image, target, 1.0).item() + decibels(share)
+    level = masked_psnr(image, target, share)
     # Kornia's "valid" map of zero-padded images is the whole map with zero padding.
     border = [_WINDOW // 2] * 4
     padded = F.pad(image, border)

@@ -12,7 +12,7 @@ from factories import random_views
 
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
-from kgs.metrics.evaluate import BEST, comparable, evaluate, mean_psnr, measure_again
+from kgs.metrics.evaluate import BEST, clipped_psnr, evaluate, mean_psnr, measure_again
 from kgs.metrics.lpips import Lpips
 
 KEYS = {"psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled", "views"}
@@ -78,8 +78,8 @@ def test_the_worst_psnr_does_not_count_as_the_best():
     """A black render of a white photo has 0 dB, a render that equals its photo an infinite PSNR, None."""
     views = random_views()
     white = replace(views, images=torch.ones_like(views.images))
-    assert comparable(mean_psnr(renderer_of(torch.zeros_like(white.images)), white)) == 0.0
-    assert comparable(mean_psnr(renderer_of(white.images), white)) == BEST
+    assert clipped_psnr(mean_psnr(renderer_of(torch.zeros_like(white.images)), white)) == 0.0
+    assert clipped_psnr(mean_psnr(renderer_of(white.images), white)) == BEST
 
 
 def test_result_can_go_to_json_and_an_infinite_psnr_is_none():
