@@ -24,7 +24,7 @@ from kgs.progress import ProgressBar, silent
 from kgs.renderer import GaussianRenderer
 
 from .fit import Fit
-from .prune import training_levels
+from .prune import psnr_per_view
 
 KINDS = ("giants", "needles", "floaters")
 MAX_STRENGTH = 100.0
@@ -170,7 +170,7 @@ def clean(fit: Fit, strength: float = 1.0, bar: ProgressBar = silent) -> Cleaned
         raise ValueError("fit: expected a scene with its photos, got one that was loaded without them")
     cameras = [views.camera(i) for i in range(len(views))]
     strays = find_strays(fit.model, strength, views.cameras, [fit.median_depth(camera) for camera in cameras])
-    before = training_levels(fit)
+    before = psnr_per_view(fit)
     candidates = strays.any.nonzero()[:, 0]
     order = candidates[_changes(fit, strays.any, bar).argsort()]
     cleaned = fit
@@ -182,7 +182,7 @@ def clean(fit: Fit, strength: float = 1.0, bar: ProgressBar = silent) -> Cleaned
         rows = torch.ones_like(strays.any)
         rows[order[:count]] = False
         part = replace(fit, model=fit.model.select(rows))
-        levels = training_levels(part)
+        levels = psnr_per_view(part)
         if all(old - new <= TOLERANCE * strength for old, new in zip(before, levels, strict=True)):
             cleaned = part
             after = levels

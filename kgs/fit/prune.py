@@ -36,7 +36,7 @@ def prune(fit: Fit) -> Fit:
         return fit
     model = fit.model
     weights = contributions(model, fit.scene.train, fit.options, fit.backend)
-    levels = training_levels(fit)
+    levels = psnr_per_view(fit)
     for limit in WEIGHTS:
         rows = weights > limit
         pruned = _part(fit, rows, model.sh_degree)
@@ -77,7 +77,7 @@ def _is_as_good(fit: Fit, levels: list[float]) -> bool:
     return all(abs(level - before) <= TOLERANCE for level, before in zip(_levels(fit), levels, strict=True))
 
 
-def training_levels(fit: Fit) -> list[float]:
+def psnr_per_view(fit: Fit) -> list[float]:
     """The PSNR of each training view in dB; `kgs.metrics.evaluate.BEST` stands for infinity."""
     return list(_levels(fit))
 
