@@ -124,7 +124,7 @@ class FitConfig:
         drop: final rate of DropGaussian, in [0, 1); 0 leaves the layer out. Unless given: 0.3, and less, down to 0,
             where many photos show the same places.
         drop_schedule: linear: the rate grows with the steps, as in the paper. constant: dropout at that rate.
-        undropped_steps: number of last steps in which no Gaussian is dropped, at most a tenth of all.
+        no_drop_steps: number of last steps in which no Gaussian is dropped, at most a tenth of all.
         sh_degree: degree of the view-dependent colour (spherical harmonics), 0 to 3. Unless given: 3
             if the colours of the training views depend on the direction, else 0.
         exposure: whether each training photo has a gain in each channel, which is estimated before the fit and held.
@@ -164,7 +164,7 @@ class FitConfig:
     steps: Annotated[int | None, _Range(1, 10_000_000)] = None
     drop: Annotated[float | None, _Range(0, 1, "[)")] = None
     drop_schedule: Literal["linear", "constant"] = "linear"
-    undropped_steps: _Count = 50
+    no_drop_steps: _Count = 50
     sh_degree: Annotated[int | None, _Range(0, 3)] = None
     exposure: Literal["auto", "each", "same"] = "auto"
     refine_poses: bool = False
@@ -243,7 +243,7 @@ def _convert(value: Any, hint: Any) -> tuple[Any, str]:
 PAPER = FitConfig(
     steps=2000,
     drop=0.2,
-    undropped_steps=0,
+    no_drop_steps=0,
     sh_degree=3,
     exposure="same",
     coarse=0.0,

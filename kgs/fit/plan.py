@@ -122,7 +122,7 @@ def make_schedule(config: FitConfig) -> Schedule:
         reset=tuple(s for s, following in pairwise(resets) if following - s >= recipe.reset_recovery),
         haze=tuple(range(looks, round(0.9 * steps) + 1, looks)),
         evaluate=tuple(sorted({max(1, round(steps * k / config.evaluations)) for k in evaluations})),
-        drop=steps - min(config.undropped_steps, round(0.1 * steps)),
+        drop=steps - min(config.no_drop_steps, round(0.1 * steps)),
         coarse=round((config.coarse or 0.0) * steps),
     )
 

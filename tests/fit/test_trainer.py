@@ -305,9 +305,9 @@ def test_the_first_steps_may_see_half_the_pixels(whole, scene, points, tmp_path)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("undropped", "last"), [(0, 30), (1, 29), (3, 27), (50, 27)])  # a tenth of 30 steps is 3
-def test_nothing_is_dropped_in_the_last_steps(scene, points, undropped, last):
-    trainer = begun(scene, points, undropped_steps=undropped, evaluations=1)
+@pytest.mark.parametrize(("no_drop", "last"), [(0, 30), (1, 29), (3, 27), (50, 27)])  # a tenth of 30 steps is 3
+def test_nothing_is_dropped_in_the_last_steps(scene, points, no_drop, last):
+    trainer = begun(scene, points, no_drop_steps=no_drop, evaluations=1)
     active = []
 
     def note(trainer, _):
