@@ -43,7 +43,7 @@ def evaluate(
 
     `render` is called with a camera and, where views have gains, with gains, as :meth:`kgs.fit.Fit.render` takes them.
 
-    With `recolor`, each channel of a render first gets the gain and the offset that fit it best to the photo: what
+    With `correct_color`, each channel of a render first gets the gain and the offset that fit it best to the photo: what
     exposure and white balance of a held-out photo do is then not counted. Where views have gains, and masks let a
     background show through, only the colours of the scene get them.
 
@@ -71,7 +71,7 @@ def evaluate(
         if look is not None:
             look(index, image)
         shown, photo, share = views.compared(index, image)
-        if recolor:
+        if correct_color:
             valid = None if views.valid_mask is None else views.valid_mask[index]
             through = None
             if views.alphas is not None and views.gains is not None:
@@ -89,7 +89,7 @@ def evaluate(
 
 
 def views_to_correct(scene: Scene) -> Views:
-    """The test views for `recolor`: where the training views have gains, with gains of 1, as `render` takes gains."""
+    """The test views for `correct_color`: where the training views have gains, with gains of 1, as `render` takes gains."""
     views = scene.test
     return views if scene.train.gains is None else replace(views, gains=torch.ones(len(views), 3))
 

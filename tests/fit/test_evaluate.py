@@ -117,7 +117,7 @@ def test_lpips_that_is_not_measured_again_is_kept():
     render = renderer_of(distort(views.images).clamp(0, 1))
     torch.manual_seed(0)
     lpips = Lpips()
-    measured = [evaluate(render, views, lpips, correct_color=recolor) for recolor in (False, True)]
+    measured = [evaluate(render, views, lpips, correct_color=correct_color) for correct_color in (False, True)]
     metrics = {"test": measured[0], "train": measured[0], "color_corrected": measured[1], "steps": 3}
     assert measure_again(Path("metrics.json"), metrics, scene, render, None) == metrics
     wrong = {**metrics, "color_corrected": {"views": []}}
