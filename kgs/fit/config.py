@@ -114,7 +114,7 @@ class FitConfig:
     """The settings of one fit. NumPy's numbers are accepted and become Python's.
 
     `fit_scene` and the command use all entries. A `Trainer` is given its initial points and removes nothing after the
-    last step: it ignores init, init_file, init_points, draw and keep_all. Unless :func:`kgs.fit.run.decide` was asked,
+    last step: it ignores init, init_file, init_points, draw and prune. Unless :func:`kgs.fit.run.decide` was asked,
     it takes a `sh_degree` of None as 0, a `drop` of None as 0.3, a `steps` of None as 1100 with more than three views,
     and all photos as equally exposed. :mod:`kgs.fit.overlap` has the numbers of steps and drop.
 
@@ -149,7 +149,7 @@ class FitConfig:
             of the background's colour. scene: the background of the scene, as in test views.
         max_gaussians: largest number of Gaussians, at which densification stops. Unless given: 10 per step, and at
             least 1.5 times the number of initial points.
-        keep_all: keep Gaussians that no training view shows, and harmonics that change no image.
+        prune: remove Gaussians that no training view shows, and harmonics that change no image.
         max_bytes: bound on the working memory of a render, in bytes; it changes results only by rounding.
         evaluations: how often the PSNR curve is measured, the last time at the end.
         device: cpu, cuda, cuda:1, ...
@@ -176,7 +176,7 @@ class FitConfig:
     draw: Literal["spread", "uniform"] = "spread"
     training_background: Literal["random", "scene"] = "random"
     max_gaussians: Annotated[int | None, _Range(1, 10**9)] = None
-    keep_all: bool = False
+    prune: bool = True
     max_bytes: Annotated[int, _Range(1, 2**62)] = 2**30  # the default of RasterOptions, which would import torch
     evaluations: _Steps = 8
     device: str = "cpu"
@@ -250,7 +250,7 @@ PAPER = FitConfig(
     init_points=10_000,
     draw="uniform",
     training_background="scene",
-    keep_all=True,
+    prune=False,
     recipe=Recipe(
         lr_scales=0.005,
         lr_quats=0.001,

@@ -24,7 +24,7 @@ QUANTUM = 0.5 / 255  # a smaller change of an 8-bit image is not visible
 
 
 def prune(fit: Fit) -> Fit:
-    """The fit with what the training views need and no more; the same one if its settings say `keep_all`.
+    """The fit with what the training views need and no more; the same one if its settings say not to prune.
 
     Takes the highest limit of `WEIGHTS` that changes the PSNR of no training view by more than `TOLERANCE`, then the
     lowest degree of harmonics for which the same holds and which changes no pixel value by more than `QUANTUM`.
@@ -32,7 +32,7 @@ def prune(fit: Fit) -> Fit:
     The history's "decisions" then have under "gaussians" how many were "fitted" and "kept", the limit "weight", and
     "sh_degree".
     """
-    if fit.settings is not None and fit.settings.keep_all:
+    if fit.settings is not None and not fit.settings.prune:
         return fit
     model = fit.model
     weights = contributions(model, fit.scene.train, fit.options, fit.backend)

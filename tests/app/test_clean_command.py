@@ -10,7 +10,7 @@ from command import one_line, run
 
 from kgs import GaussianModel, load_ply, save_ply
 
-FIT = ("--init", "scene", "--max-gaussians", 1000, "--steps", 30, "--keep-all")
+FIT = ("--init", "scene", "--max-gaussians", 1000, "--steps", 30, "--no-prune")
 
 
 @pytest.fixture(scope="module")

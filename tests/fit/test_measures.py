@@ -12,7 +12,7 @@ from kgs.fit.config import FitConfig
 from kgs.fit.measures import used_init
 from kgs.init_points import InitialPoints
 
-CONFIG = FitConfig(steps=1, evaluations=1, max_gaussians=500, init_points=30, keep_all=True)
+CONFIG = FitConfig(steps=1, evaluations=1, max_gaussians=500, init_points=30, prune=False)
 
 
 @pytest.fixture(scope="module")

@@ -72,8 +72,8 @@ def test_pruning_changes_no_other_fit_and_can_be_repeated_from_its_part(scene):
     assert torch.equal(fit.model.select(**pruned.part).means, pruned.model.means)
 
 
-def test_keep_all_keeps_all(scene):
-    fit = as_fit(scene, in_front(scene, 10), keep_all=True)
+def test_without_pruning_all_are_kept(scene):
+    fit = as_fit(scene, in_front(scene, 10), prune=False)
     assert prune(fit) is fit
 
 
