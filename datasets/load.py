@@ -52,7 +52,7 @@ def load_scene(
     photos: bool = True,
     photo_folder: str = "",
     masks: str | PathLike[str] | None = None,
-    mask_means: str = "away",
+    mask_mode: str = "ignore",
 ) -> Scene:
     """Load a scene of posed photos, whatever layout it has.
 
@@ -83,12 +83,12 @@ def load_scene(
             "images_8"; "": that of the largest, `images` first. See also :func:`kgs.datasets.field.field_size`.
         masks: a folder with masks of the photos, which have their stems; white is kept. None: those that the layout's
             files name, or those in `masks/`, and those beside the photos (`IMG_1_mask.png`, `dynamic_mask_IMG_1.png`).
-        mask_means: what black in a mask means. "away": such pixels are ignored (somebody walked by), see
-            `Views.valid_mask`. "absent": nothing is there, as where an image is transparent.
+        mask_mode: what black in a mask means. "ignore": such pixels are ignored (somebody walked by), see
+            `Views.valid_mask`. "transparent": nothing is there, as where an image is transparent.
 
     Raises:
         DataError: the folder is not a scene, or its files are missing, damaged or contradict each other.
-        ValueError: train_views, downscale, hold_out, background, points or mask_means is out of range.
+        ValueError: train_views, downscale, hold_out, background, points or mask_mode is out of range.
 
     Examples:
         >>> scene = load_scene("fern", train_views=3, downscale=2)  # doctest: +SKIP
@@ -97,7 +97,7 @@ def load_scene(
         >>> images = [view["image"] for view in scene.train]  # doctest: +SKIP
         >>> cameras = load_scene("fern", photos=False).test.cameras  # decodes no photo  # doctest: +SKIP
     """
-    check_options(downscale, hold_out, background, points, mask_means)
+    check_options(downscale, hold_out, background, points, mask_mode)
     root = Path(path)
     # The context torch.device("cpu") slows torch down: it is entered only if the default device is another.
     with nullcontext() if torch.get_default_device().type == "cpu" else torch.device("cpu"):
@@ -121,13 +121,13 @@ def load_scene(
         fine_downscale = max(1.0, (downscale or 1.0) * math.sqrt(height * width / _FINE_PIXELS))
         if photos and downscale is not None and fine_downscale < downscale:
             scales.append(_Scale.of(first, fine_downscale))
-        absent = mask_means == "absent"
-        make_views = partial(_views, offset=offset, background=color, photos=photos, absent=absent)
+        transparent = mask_mode == "transparent"
+        make_views = partial(_views, offset=offset, background=color, photos=photos, transparent=transparent)
         train_per_scale = [with_border(views) for views in make_views(train, scales)]
         at_size = train_per_scale[0]
         (test_views,) = make_views(test, scales[:1])
         colors = color_notes([frame.image for frame in (*train, *test)])
-        notes = (*frame_set.notes, *_mask_notes([*train, *test], at_size, absent), *colors)
+        notes = (*frame_set.notes, *_mask_notes([*train, *test], at_size, transparent), *colors)
         if at_size.border_mask is not None:
             notes += (_BORDER,)
         return Scene(
@@ -157,13 +157,13 @@ def _with_masks(root: Path, frame_set: FrameSet, folder: Path | None) -> FrameSe
     return replace(frame_set, frames=frames, test=None if frame_set.test is None else test, notes=notes)
 
 
-def _mask_notes(frames: Sequence[Frame], train: Views, absent: bool) -> list[str]:
+def _mask_notes(frames: Sequence[Frame], train: Views, transparent: bool) -> list[str]:
     """How many photos have masks, and what these mean, as a sentence; [] without masks."""
     masked = sum(frame.mask is not None for frame in frames)
     if not masked:
         return []
     share = "" if train.valid_mask is None else f", {1 - float(train.valid_mask.float().mean()):.0%} of the training pixels"
-    meaning = "treated as empty" if absent else f"ignored{share}"
+    meaning = "treated as empty" if transparent else f"ignored{share}"
     return [f"masks of {masked} of {len(frames)} photos: black pixels are {meaning}"]
 
 
@@ -245,7 +245,7 @@ def _is_turned(width: int, height: int, scale: _Scale) -> bool:
 
 
 def _views(
-    frames: Sequence[Frame], scales: Sequence[_Scale], offset: Tensor, background: Tensor, photos: bool, absent: bool
+    frames: Sequence[Frame], scales: Sequence[_Scale], offset: Tensor, background: Tensor, photos: bool, transparent: bool
 ) -> list[Views]:
     """The frames as views, once for each scale; their photos are decoded once, or not at all."""
     count = len(frames)
@@ -272,7 +272,7 @@ def _views(
         if image is not None:
             if frame.mask is not None:
                 kept = frame.mask.read(frame.path, width, height)
-            if kept is not None and absent:
+            if kept is not None and transparent:
                 alpha = kept[..., None] * (image[..., 3:] if image.shape[2] == 4 else 1.0)
                 image = np.concatenate([image[..., :3], alpha], axis=2)
                 kept = None

@@ -4,7 +4,7 @@ import math
 from numbers import Integral, Real
 from typing import Any
 
-MASK_MEANINGS = ("away", "absent")  # of black in a mask: ignored pixels, or empty space
+MASK_MODES = ("ignore", "transparent")  # of black in a mask: ignored pixels, or empty space
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
@@ -17,13 +17,13 @@ def held_out_between_ends(count: int, every: int) -> range:
 
 
 def check_options(
-    downscale: Any, hold_out: Any, background: str = "black", points: str = "none", mask_means: str = "away"
+    downscale: Any, hold_out: Any, background: str = "black", points: str = "none", mask_mode: str = "ignore"
 ) -> None:
     """Raise a ValueError for an argument of `load_scene` that no scene has a use for."""
     choices = (
         ("background", background, BACKGROUNDS),
         ("points", points, ("none", "model-points")),
-        ("mask_means", mask_means, MASK_MEANINGS),
+        ("mask_mode", mask_mode, MASK_MODES),
     )
     for name, value, known in choices:
         if value not in known:

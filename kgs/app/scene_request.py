@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from kgs.datasets.load import load_scene
-from kgs.datasets.options import MASK_MEANINGS
+from kgs.datasets.options import MASK_MODES
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError
 from kgs.fit.config import DETAILS
@@ -32,7 +32,7 @@ class SceneRequest:
         title: of the page; "": the name of the folder.
         photo_folder: name of the folder of photos, as "images_8"; "": that of the largest.
         masks: the folder of their masks; "": where the scene's files say, or beside the photos.
-        mask_means: what black in a mask means, "away" or "absent".
+        mask_mode: what black in a mask means, "ignore" or "transparent".
     """
 
     scene: str
@@ -46,7 +46,7 @@ class SceneRequest:
     title: str = ""
     photo_folder: str = ""
     masks: str = ""
-    mask_means: str = "away"
+    mask_mode: str = "ignore"
 
     def load(self, base: Path, say: Callable[[str], None] | None = None) -> Scene:
         """Load the scene; `base` is the folder that a relative path starts from, `say` gets the loader's notes."""
@@ -59,7 +59,7 @@ class SceneRequest:
             points=self.points,
             photo_folder=self.photo_folder,
             masks=base / self.masks if self.masks else None,
-            mask_means=self.mask_means,
+            mask_mode=self.mask_mode,
         )
         if say is not None:
             for note in scene.notes:
@@ -120,7 +120,7 @@ _EXPECTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "roll": ("a number", lambda v: is_number(v)),
     "title": ("a text", lambda v: isinstance(v, str)),
     "masks": ("a path or nothing", lambda v: isinstance(v, str) and "\0" not in v),
-    "mask_means": (f"one of {list(MASK_MEANINGS)}", lambda v: v in MASK_MEANINGS),
+    "mask_mode": (f"one of {list(MASK_MODES)}", lambda v: v in MASK_MODES),
     "photo_folder": (
         "images, images_ and a number, or nothing",
         lambda v: isinstance(v, str) and re.fullmatch(r"(images(_\d+)?)?", v) is not None,

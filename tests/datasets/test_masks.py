@@ -208,7 +208,7 @@ def test_a_folder_that_is_called_like_masks_is_named(tmp_path: Path, name: str) 
 def test_black_is_not_there(tmp_path: Path) -> None:
     write_llff(tmp_path)
     write_mask(tmp_path / "others" / "0.png")
-    scene = load_scene(tmp_path, hold_out=0, masks=tmp_path / "others", mask_means="absent", background="white")
+    scene = load_scene(tmp_path, hold_out=0, masks=tmp_path / "others", mask_mode="transparent", background="white")
     assert scene.train.valid_mask is None
     assert scene.train.alphas is not None
     assert scene.train.alphas.mean((1, 2, 3)).tolist() == pytest.approx([0.5, 1.0, 1.0])
@@ -268,8 +268,8 @@ def test_masks_that_cannot_be_found(tmp_path: Path) -> None:
     write_mask(tmp_path / "elsewhere" / "a.png")
     with pytest.raises(DataError, match="nowhere: "):
         load_scene(tmp_path, masks=tmp_path / "nowhere")
-    with pytest.raises(ValueError, match="mask_means"):
-        load_scene(tmp_path, mask_means="gone")
+    with pytest.raises(ValueError, match="mask_mode"):
+        load_scene(tmp_path, mask_mode="gone")
 
 
 def test_photos_that_are_missing_are_named_beside_masks_too(tmp_path: Path) -> None:

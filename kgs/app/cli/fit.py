@@ -47,7 +47,7 @@ def fit(
     background: Background = "black",
     frames: int | None = None,
     masks: Existing | None = None,
-    mask_means: Literal["away", "absent"] = "away",
+    mask_mode: Literal["ignore", "transparent"] = "ignore",
     preset: Literal["auto", "paper", "plain"] = "auto",
     detail: Literal["low", "normal", "high"] = "normal",
     resume: bool = False,
@@ -80,7 +80,7 @@ def fit(
             where it moves far.
         masks: folder of masks, white where a photo is kept. Unless given: masks/ beside the photos, or
             IMG_1_mask.png beside IMG_1.jpg.
-        mask_means: what black in a mask means. away: these pixels are ignored. absent: empty space.
+        mask_mode: what black in a mask means. ignore: these pixels do not count. transparent: empty space.
         preset: auto: what the training views need. paper: DropGaussian's rule and recipe, as published. plain: the same
             without dropping. See --preset paper --help-all.
         detail: sets size, steps and initial points together. low: 378 pixels. high: 1000 pixels. Options given by name
@@ -124,7 +124,7 @@ def fit(
         roll=roll,
         title=title or "",
         masks="" if masks is None else os.path.abspath(masks),
-        mask_means=mask_means,
+        mask_mode=mask_mode,
     )
     base = out
     unposed = is_unposed(scene)

@@ -44,7 +44,7 @@ def options_in(words: list[str]) -> list[str]:
 
 # The short help shows these entries of FitConfig, and all other options of the command but the rare ones.
 _OF_A_FIT = ("steps", "drop", "refine_poses", "seed", "device")
-_RARE = ("downscale", "lpips_weights", "mask_means", "frames", "title", "live")
+_RARE = ("downscale", "lpips_weights", "mask_mode", "frames", "title", "live")
 
 
 def has_short_help(command: Callable[..., Any]) -> bool:
