@@ -83,7 +83,7 @@ class _FootprintFactors(torch.autograd.Function):
         return d_rows, d_quats, d_scales
 
 
-def half_axes(covariances: Tensor) -> Tensor:
+def covariance_factors(covariances: Tensor) -> Tensor:
     """Matrices A with A A^T = Sigma for covariances Sigma `(N, 3, 3)`: `quats` of Gaussians whose scales are 1.
 
     A Cholesky factorisation in float64: of needles it adds no error to that which Sigma was rounded with. What is left
@@ -98,7 +98,7 @@ def half_axes(covariances: Tensor) -> Tensor:
 
 
 class _HalfAxes(torch.autograd.Function):
-    """`half_axes` and its gradient."""
+    """`covariance_factors` and its gradient."""
 
     @staticmethod
     def forward(ctx: Any, covariances: Tensor) -> Tensor:
@@ -125,7 +125,7 @@ class _HalfAxes(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> Tensor:
         if torch.is_grad_enabled():
-            raise RuntimeError("half_axes: expected backward without create_graph, there is no second derivative")
+            raise RuntimeError("covariance_factors: expected backward without create_graph, there is no second derivative")
         (factors,) = ctx.saved_tensors
         flat = factors.diagonal(dim1=1, dim2=2) == 0  # the gradient is 0 there, too
         whole = factors + torch.diag_embed(flat.double())

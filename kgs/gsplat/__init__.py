@@ -106,7 +106,7 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
         rasterize_mode: "classic", or "antialiased": see :class:`kgs.RasterOptions`.
         camera_model: "pinhole", "fisheye" (equidistant) or "ortho".
         covars: covariances in place of `quats` and `scales`, `(..., N, 3, 3)`: their upper triangles, see
-            :func:`kgs.covariance.half_axes`.
+            :func:`kgs.covariance.covariance_factors`.
         return_normals: `meta["normals"]` are the sums of w times normal, `(..., C, H, W, 3)`; the normal is the third
             local axis, turned towards the camera, in world axes.
         extra_signals: more features, `(..., N, E)` or `(..., C, N, E)`, rendered into `meta["render_extra_signals"]`.

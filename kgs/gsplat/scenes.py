@@ -13,7 +13,7 @@ from kornia.sensors.camera import CameraModel, CameraModelType
 from torch import Tensor
 
 from kgs.camera import Cameras, PosedCamera, pinhole_cameras
-from kgs.covariance import half_axes
+from kgs.covariance import covariance_factors
 from kgs.harmonics import evaluate_harmonics
 from kgs.projection import view_directions
 from kgs.types import SH_SIZES, Gaussians, ProjectedGaussians, check_tensor
@@ -96,7 +96,7 @@ def split(
     else:
         upper = flat("covars", covars, (n, 3, 3)).triu()  # all that gsplat reads
         whole = upper + upper.triu(1).mT
-        quats = half_axes(whole.flatten(0, 1)).view_as(whole)
+        quats = covariance_factors(whole.flatten(0, 1)).view_as(whole)
         scales = torch.ones_like(whole[..., 0])
     opacities = flat("opacities", opacities, (n,), (count, n))
     intrinsics = flat("Ks", intrinsics, (count, 3, 3))
