@@ -126,7 +126,7 @@ class ViewGeometry:
         world: Tensor = (local - self.extrinsics[views, :3, 3])[:, None] @ self.extrinsics[views, :3, :3]
         return world[:, 0]
 
-    def between(self, view: int, other: int) -> tuple[Tensor, Tensor]:
+    def relative_projection(self, view: int, other: int) -> tuple[Tensor, Tensor]:
         """H `(3, 3)` and t `(3,)`: a pixel (x, y) of `view` at depth d is at H (x, y, 1) d + t in `other`, homogeneous.
 
         The third of these coordinates is its depth in `other`.

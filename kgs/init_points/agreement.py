@@ -49,7 +49,7 @@ def average_depths(geometry: ViewGeometry, maps: list[DepthMap], certain: list[T
         for other, pixels, depths in _in_other_views(geometry, own.depths[rows, columns], rows, columns, view):
             x, y, inside = nearest_pixels(pixels, depths, *own.depths.mT.shape)
             other_depths = 1 / interpolate(inverse[other][None], pixels)[:, 0]
-            turn, shift = geometry.between(other, view)
+            turn, shift = geometry.relative_projection(other, view)
             own_depths = convert_points_to_homogeneous(pixels) @ turn[2] * other_depths + shift[2]
             similar = (other_depths / depths - 1).abs() < SIMILAR
             similar &= inside & certain[other][y, x] & (own_depths > 0)
@@ -107,7 +107,7 @@ def agreeing_views(
         x, y, inside = nearest_pixels(pixels, depths, *maps[view].depths.mT.shape)
         other_depths = maps[other].depths[y, x].double()
         # the other view's pixel as this view sees it: at the other view's depth, and at that of the point
-        turn, shift = geometry.between(other, view)
+        turn, shift = geometry.relative_projection(other, view)
         rays = _rays(x, y) @ turn.mT
         at_other_depth = _dehomogenise(rays * other_depths[:, None] + shift)
         at_own_depth = _dehomogenise(rays * depths[:, None] + shift)
@@ -123,7 +123,7 @@ def _in_other_views(
     rays = _rays(columns, rows) * depths.double()[:, None]
     for other in range(len(geometry)):
         if other != view:
-            turn, shift = geometry.between(view, other)
+            turn, shift = geometry.relative_projection(view, other)
             there = rays @ turn.mT + shift
             yield other, _dehomogenise(there), there[:, 2]
 

@@ -101,7 +101,7 @@ def _neighbours(geometry: ViewGeometry, view: int, depth: float) -> list[int]:
 
 def _homographies(geometry: ViewGeometry, view: int, other: int, inverse: Tensor) -> Tensor:
     """From pixels of a view to those of another, for each plane, `(D, 3, 3)`: K' (R + t n^T / d) K^-1 at depth d."""
-    turn, shift = geometry.between(view, other)
+    turn, shift = geometry.relative_projection(view, other)
     homographies = turn.repeat(len(inverse), 1, 1)
     homographies[:, :, 2] += inverse[:, None] * shift
     return homographies
