@@ -61,7 +61,7 @@ def average_depths(geometry: ViewGeometry, maps: list[DepthMap], certain: list[T
     return averaged
 
 
-def agreed_pixels(geometry: ViewGeometry, maps: list[DepthMap], certain: list[Tensor], view: int) -> Tensor:
+def consistent_pixels(geometry: ViewGeometry, maps: list[DepthMap], certain: list[Tensor], view: int) -> Tensor:
     """Which of one view's certain pixels another view and their neighbours confirm, `(H, W)`."""
     views = confirming_views(geometry, maps, certain, view)
     confirmed = views > 0

@@ -17,7 +17,7 @@ from kgs.datasets.scene import Views
 from kgs.geometry import ViewGeometry
 from kgs.progress import ProgressBar, silent
 
-from .agreement import agreed_pixels, average_depths
+from .agreement import consistent_pixels, average_depths
 from .patches import PatchColors, patch_colors
 from .plane_sweep import DepthMap, plane_count, planes_wanted, sweep_depths
 
@@ -148,7 +148,7 @@ def _agreed(
     views: Views, geometry: ViewGeometry, maps: list[DepthMap], certain: list[Tensor], view: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The points of one view's pixels on which views agree, their colours, and their `(view, x, y)`."""
-    rows, columns = agreed_pixels(geometry, maps, certain, view).nonzero().unbind(1)
+    rows, columns = consistent_pixels(geometry, maps, certain, view).nonzero().unbind(1)
     pixels = torch.stack([columns, rows], 1)
     depths = maps[view].depths[rows, columns].double()
     points = geometry.unproject(pixels, depths, torch.full_like(rows, view))

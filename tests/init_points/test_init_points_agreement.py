@@ -9,7 +9,7 @@ from init_point_scenes import cameras
 
 from kgs.geometry import ViewGeometry
 from kgs.init_points import agreement
-from kgs.init_points.agreement import agreed_pixels, average_depths
+from kgs.init_points.agreement import consistent_pixels, average_depths
 from kgs.init_points.plane_sweep import DepthMap
 
 WIDTH, HEIGHT, DEPTH = 40, 30, 4.0
@@ -28,7 +28,7 @@ def wall(depth: float) -> DepthMap:
 
 def agreed(maps: list[DepthMap], certain: list[torch.Tensor]) -> torch.Tensor:
     """Which pixels of the first view are kept."""
-    return agreed_pixels(GEOMETRY, maps, certain, 0)
+    return consistent_pixels(GEOMETRY, maps, certain, 0)
 
 
 def test_similar_depths_are_averaged_and_agree_then() -> None:
@@ -74,7 +74,7 @@ def test_a_small_piece_before_its_surroundings_needs_two_other_views(
     for view, shift in enumerate([0, -7, 7][: 1 + confirming]):  # at half the depth twice as far
         left = 17 + shift
         maps[view].depths[12 : 12 + SQUARE, left : left + SQUARE] = DEPTH / 2
-    kept = agreed_pixels(ViewGeometry.of(beside), maps, 3 * [EVERYWHERE], 0)
+    kept = consistent_pixels(ViewGeometry.of(beside), maps, 3 * [EVERYWHERE], 0)
     inside = kept[13 : 11 + SQUARE, 18 : 16 + SQUARE]
     assert bool(inside.any()) == bool(inside.all()) == (confirming == 2)
     assert bool(kept[:8, 8:-8].all())  # the wall

@@ -15,7 +15,7 @@ from kgs.datasets import load_scene
 from kgs.fit.config import FitConfig
 from kgs.fit.run import fit_scene
 from kgs.geometry import ViewGeometry, nearest_pixels
-from kgs.init_points.agreement import agreed_pixels
+from kgs.init_points.agreement import consistent_pixels
 from kgs.init_points.dense import agreed_depths
 
 SCENES = ("llff/fern", "llff/flower", "colmap/trex", "colmap/fortress")
@@ -58,7 +58,7 @@ def _rows(data: Path, name: str, seed: int) -> list[Row]:
     near, far = depth_range(scene.train)
     maps, certain = agreed_depths(scene.train, near, far)
     of_points = [
-        torch.where(agreed_pixels(geometry, maps, certain, view), maps[view].depths, 0.0) for view in range(VIEWS)
+        torch.where(consistent_pixels(geometry, maps, certain, view), maps[view].depths, 0.0) for view in range(VIEWS)
     ]
     true = confirmed_depths(everything, near, far, list(range(len(everything))))
     of_name = dict(zip(everything.names, true, strict=True))

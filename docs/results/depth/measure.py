@@ -15,7 +15,7 @@ from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths
 from kgs.geometry import ViewGeometry
-from kgs.init_points.agreement import agreed_pixels, confirming_views
+from kgs.init_points.agreement import consistent_pixels, confirming_views
 from kgs.init_points.dense import agreed_depths, small_enough
 from kgs.init_points.depth_limits import certain_points, sweep_range
 
@@ -119,7 +119,7 @@ def _row(known: Truth) -> Row:
     begin = time.perf_counter()
     geometry = ViewGeometry.of(known.views.cameras)
     maps, certain = agreed_depths(known.views, known.near, known.far)
-    agreed = torch.stack([agreed_pixels(geometry, maps, certain, view) for view in range(len(maps))])
+    agreed = torch.stack([consistent_pixels(geometry, maps, certain, view) for view in range(len(maps))])
     seconds = time.perf_counter() - begin
     depths = torch.stack([depth_map.depths for depth_map in maps]).double()
     is_known = known.depths > 0
