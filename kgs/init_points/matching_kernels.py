@@ -11,7 +11,7 @@ threads write to the same place.
 import numpy as np
 
 from kgs.compiled.kernel import ZERO, f32, jit
-from kgs.compiled.threads import over
+from kgs.compiled.threads import parallel_for
 
 BANDS = 16
 INFINITY = f32(np.inf)
@@ -26,7 +26,7 @@ def mutual_nearest(threads, lines, places, descriptors, line_distance, ratio, mo
     match1 = np.zeros(n, np.int64)
     match2 = np.zeros((BANDS, m), np.int64)
     results = (near1, rival1, match1, near2, rival2, match2)
-    over(threads, BANDS, find_nearest, lines, places, *descriptors, f32(line_distance), *results, pieces=BANDS)
+    parallel_for(threads, BANDS, find_nearest, lines, places, *descriptors, f32(line_distance), *results, pieces=BANDS)
     if not m:
         return near1[:0], match1[:0], match1[:0]
     rival2 = np.partition(np.concatenate([near2, rival2]), 1, axis=0)[1]

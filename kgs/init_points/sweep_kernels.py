@@ -18,7 +18,7 @@ as written, so that the bits depend neither on threads nor on the processor.
 import numpy as np
 
 from kgs.compiled.kernel import ONE, ZERO, exact, f32, inline
-from kgs.compiled.threads import over
+from kgs.compiled.threads import parallel_for
 
 HALO = 3  # pixels of a window on each side of its centre
 SIDE = 2 * HALO + 1
@@ -34,7 +34,7 @@ def compare(threads, image, mean, variance, constants, others, homographies, cos
     """Write 1 minus the scores of all planes to `cost`."""
     height, width = mean.shape
     tiles = -(-height // TILE_ROWS) * -(-width // TILE_COLUMNS)
-    over(threads, tiles, compare_tiles, image, mean, variance, constants, others, homographies, cost, pieces=tiles)
+    parallel_for(threads, tiles, compare_tiles, image, mean, variance, constants, others, homographies, cost, pieces=tiles)
 
 
 def semi_global(threads, cost, grey, prices, total):
@@ -42,7 +42,7 @@ def semi_global(threads, cost, grey, prices, total):
     total[:] = ZERO
     for dy, dx in DIRECTIONS:
         groups = -(-(cost.shape[1] if dy else cost.shape[0]) // PATHS)
-        over(threads, groups, add_paths, cost, grey, dy, dx, prices, total, pieces=groups)
+        parallel_for(threads, groups, add_paths, cost, grey, dy, dx, prices, total, pieces=groups)
 
 
 @inline

@@ -10,7 +10,7 @@ from torch import Tensor
 from kgs.backends.base import CompositingCall, CompositingInputs, Compositor, Images
 from kgs.backends.row_slices import row_slices
 from kgs.compiled.arrays import arrays
-from kgs.compiled.threads import over
+from kgs.compiled.threads import parallel_for
 from kgs.memory import array, empty
 from kgs.torch_threads import thread_count
 
@@ -109,7 +109,7 @@ class CpuCompositor(Compositor):
         ]
         factors, opacities = arrays(inputs.factors, inputs.opacities)
         moments = (self._coverage.ranks, totals, factors, opacities, self._eps2d)
-        over(thread_count(), len(inputs.means2d), kernels.fill_gradients, *moments, *arrays(*results))
+        parallel_for(thread_count(), len(inputs.means2d), kernels.fill_gradients, *moments, *arrays(*results))
         gradients = tuple(x if need else None for x, need in zip(results[:4], needs, strict=True))
         return gradients, results[4] if needs_absolute else None
 
@@ -135,7 +135,7 @@ class CpuCompositor(Compositor):
                 if keep:
                     done[b] = _Done(band, starts, strips, reached)
 
-        over(thread_count(), count, work, pieces=count)
+        parallel_for(thread_count(), count, work, pieces=count)
         return part, done
 
     def _backward(
@@ -161,8 +161,8 @@ class CpuCompositor(Compositor):
                     kernels.composite_backward(*lists, *block, *of_band, rows[band.members])
 
         threads = thread_count()
-        over(threads, len(done), work, pieces=len(done))
-        over(threads, len(totals), kernels.add_members, part.offsets, part.members, sums, totals)
+        parallel_for(threads, len(done), work, pieces=len(done))
+        parallel_for(threads, len(totals), kernels.add_members, part.offsets, part.members, sums, totals)
 
 
 def _blocks(features: int) -> list[tuple[int, int]]:

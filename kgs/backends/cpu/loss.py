@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from kgs.compiled.arrays import Array, arrays
-from kgs.compiled.threads import over
+from kgs.compiled.threads import parallel_for
 from kgs.memory import array, empty
 from kgs.torch_threads import thread_count
 
@@ -31,7 +31,7 @@ def loss_and_gradient(
     bands, pieces = _division(x)
     maps = array((3, *x.shape))
     sums = np.zeros((bands, 2))
-    over(threads, bands, ssim_maps, half, x, y, mean_y, variance_y, maps, sums, pieces=pieces)
+    parallel_for(threads, bands, ssim_maps, half, x, y, mean_y, variance_y, maps, sums, pieces=pieces)
     absolute, ssim = sums.sum(0) / x.size
     loss = image.new_tensor(absolute + dssim_weight * (1.0 - np.minimum(ssim, 1.0)))
     if not gradient:
@@ -39,11 +39,11 @@ def loss_and_gradient(
     image_gradient = torch.empty_like(image, memory_format=torch.contiguous_format)
     padded = array((channels, height + 2 * RADIUS, width))
     bands = channels * -(-padded.shape[1] // BAND)
-    over(threads, bands, ssim_gradient, half, x, y, maps, padded, pieces=pieces)
+    parallel_for(threads, bands, ssim_gradient, half, x, y, maps, padded, pieces=pieces)
     by_ssim = np.float32(-dssim_weight / x.size)
     by_l1 = np.float32(1 / x.size)
     out = image_gradient.flatten(0, 1).numpy()
-    over(threads, channels * height, total_gradient, x, y, padded, by_ssim, by_l1, out, pieces=pieces)
+    parallel_for(threads, channels * height, total_gradient, x, y, padded, by_ssim, by_l1, out, pieces=pieces)
     return loss, image_gradient
 
 
@@ -53,7 +53,7 @@ def local_moments(target: Tensor, taps: list[float]) -> tuple[Tensor, Tensor]:
     half = _half(taps)
     mean, variance = (empty((1, *y.shape), target) for _ in range(2))
     bands, pieces = _division(y)
-    over(thread_count(), bands, fill_moments, half, y, mean[0].numpy(), variance[0].numpy(), pieces=pieces)
+    parallel_for(thread_count(), bands, fill_moments, half, y, mean[0].numpy(), variance[0].numpy(), pieces=pieces)
     return mean, variance
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from kgs.backends.torch.projection import project as project_in_torch
 from kgs.camera import MARGIN, Cameras, Frame, whole_frame
 from kgs.compiled.arrays import Array, arrays
-from kgs.compiled.threads import over
+from kgs.compiled.threads import parallel_for
 from kgs.memory import array, empty
 from kgs.projection import finite_gaussians, visibility_cutoff
 from kgs.torch_threads import thread_count
@@ -71,7 +71,7 @@ class _Projection(torch.autograd.Function):
             lists = [*(empty(shape, inputs[0]) for shape in shapes), torch.from_numpy(array(n, np.int64))]
             out = tuple(x.numpy() for x in lists)
             threads = thread_count()
-            over(threads, len(counts), footprints, *values, c, view, frustum, out, counts, pieces=16)
+            parallel_for(threads, len(counts), footprints, *values, c, view, frustum, out, counts, pieces=16)
             visible = _close_up(out, counts[:, 0])
             parts.append([x[:visible] for x in lists])
         joined = [x[0] if len(parts) == 1 else torch.cat(x) for x in zip(*parts, strict=True)]
@@ -110,11 +110,11 @@ class _Projection(torch.autograd.Function):
             own = tuple(x[begin : begin + len(ids)] for x in gradients)
             if any(needs[:5]):
                 of_gaussians = (means, quats, scales, colors, c, view, ids, own, outs)
-                over(thread_count(), len(means), footprint_gradients, *of_gaussians)
+                parallel_for(thread_count(), len(means), footprint_gradients, *of_gaussians)
             if any(needs[5:]):
                 rows = np.empty((len(ids), 21), np.float32)
                 of_camera = (means, quats, scales, colors, view, ids, own, rows)
-                over(thread_count(), len(ids), camera_gradients, *of_camera)
+                parallel_for(thread_count(), len(ids), camera_gradients, *of_camera)
                 total = rows.sum(0, np.float64)
                 poses[c, :3] = total[:12].reshape(3, 4)
                 intrinsics[c, :3, :3] = total[12:].reshape(3, 3)
