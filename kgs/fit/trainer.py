@@ -76,7 +76,7 @@ class Trainer:
     def __init__(self, scene: Scene, plan: Plan, points: InitialPoints | dict[str, Any]) -> None:
         check_kind("scene", scene, Scene)
         check_kind("plan", plan, Plan)
-        self._given = scene
+        self._input_scene = scene
         self.scene = scene
         self.plan = plan
         self.saved = ""
@@ -171,7 +171,7 @@ class Trainer:
             raise ValueError(f"steps: expected a step of {schedule.steps} to be left, got none")
         start = time.perf_counter()
         with threads_beside(self.plan.backend), torch.enable_grad():
-            loss = self._descend()
+            loss = self._optimize()
         state.seconds += time.perf_counter() - start
         if state.step in schedule.evaluate:  # before densifying: right after it the image is 2 dB worse for a while
             self._measure_curve()
@@ -232,8 +232,8 @@ class Trainer:
             longer = check_saved(values, self._fingerprint, plan.config, plan.schedule.steps)
             runs = next(x for x in BACKENDS if x.name == values["backend"]).runs_on(plan.device)
             backend = resolve(values["backend"] if runs else "auto", plan.device)
-            exposed = with_exposure(self._given, values["decisions"])
-        state = TrainState.from_dict(self._given, plan, values)
+            exposed = with_exposure(self._input_scene, values["decisions"])
+        state = TrainState.from_dict(self._input_scene, plan, values)
         self.plan = replace(plan, backend=backend, decisions=values["decisions"])
         state.notes += longer
         self._use(state, exposed)
@@ -291,7 +291,7 @@ class Trainer:
             trainer.state.note(f"{damage}; went on from the previous checkpoint, of step {trainer.step}")
         return trainer
 
-    def _descend(self) -> float:
+    def _optimize(self) -> float:
         """Render a training view, compare it with its photo, and move the parameters; returns the loss."""
         state = self.state
         config = self.plan.config

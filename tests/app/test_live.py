@@ -94,13 +94,13 @@ class Fit:
 @pytest.fixture
 def slow_steps(monkeypatch: Any) -> None:
     """Steps that take as long as a page needs to ask again, at least."""
-    step = Trainer._descend
+    step = Trainer._optimize
 
     def slow(self: Trainer) -> float:
         time.sleep(0.05)
         return step(self)
 
-    monkeypatch.setattr(Trainer, "_descend", slow)
+    monkeypatch.setattr(Trainer, "_optimize", slow)
 
 
 def test_it_shows_the_splat_as_it_grows_and_changes_no_bit_of_it(scene: Any, tmp_path: Path, slow_steps: None) -> None:
@@ -140,14 +140,14 @@ def test_it_ends_with_a_fit_that_fails(scene: Any, tmp_path: Path, slow_steps: N
 
 
 def test_it_ends_with_a_fit_that_is_stopped(scene: Any, tmp_path: Path, slow_steps: None, monkeypatch: Any) -> None:
-    step = Trainer._descend
+    step = Trainer._optimize
 
     def interrupted(self: Trainer) -> float:
         if self.step == 3:
             os.kill(os.getpid(), signal.SIGINT)
         return step(self)
 
-    monkeypatch.setattr(Trainer, "_descend", interrupted)
+    monkeypatch.setattr(Trainer, "_optimize", interrupted)
     fit = Fit(scene, tmp_path)
     assert fit.error is None
     assert fit.watcher
@@ -203,7 +203,7 @@ TEXT = "document.querySelector('.live').textContent"
 
 
 def test_the_splat_on_the_page_changes_and_the_eye_does_not(scene: Any, tmp_path: Path, monkeypatch: Any) -> None:
-    step = Trainer._descend
+    step = Trainer._optimize
     allowed = Semaphore(0)
     lines: list[str] = []
 
@@ -211,7 +211,7 @@ def test_the_splat_on_the_page_changes_and_the_eye_does_not(scene: Any, tmp_path
         assert allowed.acquire(timeout=60)
         return step(self)
 
-    monkeypatch.setattr(Trainer, "_descend", when_allowed)
+    monkeypatch.setattr(Trainer, "_optimize", when_allowed)
     config = replace(CONFIG, steps=200)
     arguments = (scene, config, tmp_path / "out", SceneRequest("/photos", 3))
     fit = Thread(target=lambda: app.fit_folder(*arguments, live=True, say=lines.append), daemon=True)

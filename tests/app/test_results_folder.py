@@ -325,14 +325,14 @@ def test_a_demo_does_not_mix_with_a_fit(done: Path) -> None:
 
 def test_a_file_that_the_user_writes_or_changes_during_a_fit_is_kept(scene: Any, done: Path, monkeypatch: Any) -> None:
     """In the folder of the results and in that of the unfinished fit; and a line says where."""
-    plain = Trainer._descend
+    plain = Trainer._optimize
 
     def meanwhile(self: Trainer) -> float:
         for name in ("cameras.json", "notes.txt", "unfinished-1/notes.txt", "unfinished-1/splat.ply"):
             (done / name).write_text("mine")
         return plain(self)
 
-    monkeypatch.setattr(Trainer, "_descend", meanwhile)
+    monkeypatch.setattr(Trainer, "_optimize", meanwhile)
     lines = fit(scene, OTHER, done)
     assert seed_of(done) == 1
     for name in ("kept/cameras.json", "notes.txt", "unfinished-1/notes.txt", "unfinished-1/kept/splat.ply"):
@@ -359,14 +359,14 @@ def test_what_the_new_results_lack_goes_but_for_what_is_the_users(scene: Any, do
 
 def interrupt_at(step: int, patch: Any) -> None:
     """The process gets SIGINT as this step begins."""
-    plain = Trainer._descend
+    plain = Trainer._optimize
 
     def interrupted(self: Trainer) -> float:
         if self.step == step:
             os.kill(os.getpid(), signal.SIGINT)
         return plain(self)
 
-    patch.setattr(Trainer, "_descend", interrupted)
+    patch.setattr(Trainer, "_optimize", interrupted)
 
 
 def test_an_interrupted_fit_leaves_a_finished_one_in_its_place(scene: Any, done: Path, monkeypatch: Any) -> None:

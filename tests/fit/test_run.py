@@ -52,7 +52,7 @@ def trainer(scene: Any) -> Trainer:
 
 def at_step(trainer: Trainer, step: int, act: Any) -> None:
     """Do something in the middle of a step."""
-    plain = trainer._descend
+    plain = trainer._optimize
 
     def descend() -> float:
         loss = plain()
@@ -60,7 +60,7 @@ def at_step(trainer: Trainer, step: int, act: Any) -> None:
             act()
         return loss
 
-    trainer._descend = descend  # type: ignore[method-assign]
+    trainer._optimize = descend  # type: ignore[method-assign]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
