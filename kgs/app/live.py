@@ -15,7 +15,7 @@ from kgs.torch_threads import torch_on_one_thread
 from kgs.types import Gaussians
 
 from .live_server import LiveServer
-from .page.data import plain
+from .page.data import pack_float32
 from .page.fit_page import live_page
 
 _PAUSE = 2.0  # least seconds between two splats

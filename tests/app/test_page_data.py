@@ -12,7 +12,7 @@ from factories import batch, random_camera, random_gaussians, replace
 
 import kgs
 from kgs import Gaussians
-from kgs.app.page.data import PIXEL_ERROR, Packed, pack, plain
+from kgs.app.page.data import PIXEL_ERROR, Packed, pack, pack_float32
 
 SIZE = (90, 120)
 
@@ -80,7 +80,7 @@ def test_the_plain_form_has_the_values_in_their_order(sh_degree: int | None) -> 
     opacities[:5], means[7, 1] = 0.003, torch.nan
     colors = exact.colors if sh_degree is not None else torch.rand(100, 3)
     given = replace(exact, opacities=opacities, means=means, colors=colors)
-    packed = plain(given)
+    packed = pack_float32(given)
     names = packed.layout["columns"]
     rows = np.frombuffer(packed.content, "<f4").reshape(len(names), packed.layout["count"]).astype(float)
     shown = gaussians_of(packed, dict(zip(names, rows, strict=True)))

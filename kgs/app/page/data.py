@@ -128,7 +128,7 @@ def pack(
     return packed._replace(left_out=", ".join(words))
 
 
-def plain(gaussians: Gaussians) -> Packed:
+def pack_float32(gaussians: Gaussians) -> Packed:
     """Gaussians for a viewer on the same machine: ten times as fast as :func:`pack`, in three times the bytes or more.
 
     Invisible Gaussians are left out, and the order is kept. `columns` of the layout has the names of the columns only;
