@@ -18,7 +18,7 @@ from torch import Tensor
 
 from kgs import GaussianRenderer, Gaussians
 from kgs.app.files import encoders, film
-from kgs.app.files.film import tour, write_film
+from kgs.app.files.film import camera_path, write_film
 from kgs.datasets.scene import Views
 
 
@@ -78,7 +78,7 @@ PATHS = {
 
 @pytest.mark.parametrize("poses", PATHS.values(), ids=PATHS)
 def test_the_path_passes_each_camera_and_is_smooth(request: Any, poses: Tensor) -> None:
-    path = tour(poses, evenly(2000), 1.0)
+    path = camera_path(poses, evenly(2000), 1.0)
     if "6 facing" in request.node.name:  # cameras side by side are never left
         assert (centers(path) >= centers(poses).amin(0) - 1e-9).all()
         assert (centers(path) <= centers(poses).amax(0) + 1e-9).all()
@@ -96,7 +96,7 @@ def test_the_path_passes_each_camera_and_is_smooth(request: Any, poses: Tensor) 
 
 def test_cameras_around_an_object_are_passed_on_arcs_that_look_at_it() -> None:
     poses = ring(5)
-    path = tour(poses, evenly(100), 1.0)
+    path = camera_path(poses, evenly(100), 1.0)
     places = centers(path)
     radii, lengths = places.norm(dim=1), centers(poses).norm(dim=1)
     assert (lengths.min() - 0.05 < radii).all()  # a chord of the ring would come to 2.4
@@ -109,7 +109,7 @@ def test_cameras_around_an_object_are_passed_on_arcs_that_look_at_it() -> None:
 @pytest.mark.parametrize("poses", [*PATHS.values(), ring(12), ring(7)[:1]], ids=[*PATHS, "ring of 12", "1"])
 def test_the_camera_moves_at_one_speed_between_the_ends(poses: Tensor) -> None:
     """Measured on the poses of the film: where the path does not turn back, steps are as long as each other."""
-    path = film.paced(poses, 400, 3.0)
+    path = film.resample_by_speed(poses, 400, 3.0)
     places = centers(path)
     unit = torch.cdist(centers(poses), centers(poses)).max() if len(poses) > 1 else 3.0
     moves = torch.cat([places / unit, path[:, 2, :3] / math.pi], 1).diff(dim=0)
@@ -126,7 +126,7 @@ def test_the_camera_moves_at_one_speed_between_the_ends(poses: Tensor) -> None:
     assert (lengths[:20].diff() > -1e-6 * cruise).all()  # gets up to its speed
     assert (lengths[-20:].diff() < 1e-6 * cruise).all()
     assert (lengths.diff().abs() < 0.25 * cruise).all()  # no jolt
-    torch.testing.assert_close(path[0], tour(poses, evenly(1), 3.0)[0])
+    torch.testing.assert_close(path[0], camera_path(poses, evenly(1), 3.0)[0])
 
 
 def test_an_even_path_takes_each_step_in_the_same_time() -> None:
@@ -134,7 +134,7 @@ def test_an_even_path_takes_each_step_in_the_same_time() -> None:
     count, frames = 12, 240
     rim = 2 * math.pi * torch.arange(count).double() / count
     poses = looking_at(torch.zeros(3).double(), torch.stack([rim.cos(), rim.sin(), 0.3 * torch.ones(count)], 1))
-    places = centers(film.paced(poses, frames, 1.0))
+    places = centers(film.resample_by_speed(poses, frames, 1.0))
     steps = torch.atan2(places[:, 1], places[:, 0]).diff().remainder(2 * math.pi)
     steps = torch.minimum(steps, 2 * math.pi - steps)
     expected = 2 * math.pi / frames * (0.86 + 2 * 0.14)
@@ -143,12 +143,12 @@ def test_an_even_path_takes_each_step_in_the_same_time() -> None:
 
 @pytest.mark.parametrize(("count", "bound"), [(12, 1.2), (40, 1.3)])
 def test_the_round_trip_is_short(count: int, bound: float) -> None:
-    assert centers(tour(ring(count), evenly(120), 1.0)).diff(dim=0).norm(dim=1).sum() < 2 * math.pi * 3.0 * bound
+    assert centers(camera_path(ring(count), evenly(120), 1.0)).diff(dim=0).norm(dim=1).sum() < 2 * math.pi * 3.0 * bound
 
 
 def test_a_single_camera_sways_and_keeps_its_target() -> None:
     pose = ring(7)[2]
-    path = tour(pose[None], evenly(60), depth=4.0)
+    path = camera_path(pose[None], evenly(60), depth=4.0)
     torch.testing.assert_close(path[0], pose)
     target = torch.linalg.inv(pose) @ torch.tensor([0.0, 0.0, 4.0, 1.0]).double()
     seen = path @ target
@@ -158,8 +158,8 @@ def test_a_single_camera_sways_and_keeps_its_target() -> None:
 
 
 def test_cameras_at_one_place_are_no_trouble() -> None:
-    assert tour(facing(1).repeat(3, 1, 1), evenly(10), 1.0).isfinite().all()
-    assert film.paced(facing(1).repeat(3, 1, 1), 10, 1.0).isfinite().all()
+    assert camera_path(facing(1).repeat(3, 1, 1), evenly(10), 1.0).isfinite().all()
+    assert film.resample_by_speed(facing(1).repeat(3, 1, 1), 10, 1.0).isfinite().all()
 
 
 def views_of(size: tuple[int, int], focal: float | None = None, poses: Tensor | None = None) -> Views:

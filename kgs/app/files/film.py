@@ -39,9 +39,9 @@ def write_film(
     depth: float,
     bar: ProgressBar = silent,
 ) -> str:
-    """Write a film along the :func:`tour` through some views, as MP4 or WebM by the suffix. The write is atomic.
+    """Write a film along the :func:`camera_path` through some views, as MP4 or WebM by the suffix. The write is atomic.
 
-    The film has `FRAMES` frames at `RATE` frames per second; see :func:`paced` for its speed. Frames have the size of
+    The film has `FRAMES` frames at `RATE` frames per second; see :func:`resample_by_speed` for its speed. Frames have the size of
     the views, reduced to at most `LONGEST` pixels and rounded to even numbers.
 
     Args:
@@ -56,7 +56,7 @@ def write_film(
     """
     path = Path(path)
     size, lens = _frame_lens(views)
-    poses = paced(views.cameras.extrinsics, FRAMES, depth).to(lens)
+    poses = resample_by_speed(views.cameras.extrinsics, FRAMES, depth).to(lens)
     part = path.with_name(f".{path.name}")  # OpenCV chooses the format by the suffix
     cameras = (pinholes(lens[None], pose[None], size) for pose in bar(list(poses), "film", "frame"))
     try:
@@ -96,8 +96,8 @@ def _frame_lens(views: Views) -> tuple[tuple[int, int], Tensor]:
     return size, lens
 
 
-def paced(extrinsics: Tensor, frames: int, depth: float) -> Tensor:
-    """Poses of a :func:`tour` at the times of the frames of a film, in which the camera moves at one speed.
+def resample_by_speed(extrinsics: Tensor, frames: int, depth: float) -> Tensor:
+    """Poses of a :func:`camera_path` at the times of the frames of a film, in which the camera moves at one speed.
 
     The speed is that of the position, in largest distances between cameras, and of the viewing direction, in half
     turns, as the hypotenuse of both. The film begins and ends at rest, with the same acceleration over the first and
@@ -115,17 +115,17 @@ def paced(extrinsics: Tensor, frames: int, depth: float) -> Tensor:
         `(frames, 4, 4)`, float64.
     """
     even = np.linspace(0, 1, _PIECES + 1)
-    path = torch.linalg.inv(tour(extrinsics, even, depth))
+    path = torch.linalg.inv(camera_path(extrinsics, even, depth))
     centers = camera_centers(extrinsics)
     unit = float(torch.cdist(centers, centers).max()) or depth
     places = torch.cat([path[:, :3, 3] / unit, path[:, :3, 2] / torch.pi], 1).numpy()
     done = np.append(0, np.linalg.norm(np.diff(places, axis=0), axis=1).cumsum())
     if done[-1] < 1e-9:  # it does not move
-        return tour(extrinsics, np.arange(frames) / frames, depth)
+        return camera_path(extrinsics, np.arange(frames) / frames, depth)
     shares = np.interp(even, done / done[-1], even)  # of the path's time, after equal parts of its length
     speeds = _speeds(np.stack([np.interp(shares, even, column) for column in places.T], 1))
     times = np.append(0, (2 / (speeds[1:] + speeds[:-1])).cumsum())
-    return tour(extrinsics, np.interp(np.arange(frames) / frames, times / times[-1], shares), depth)
+    return camera_path(extrinsics, np.interp(np.arange(frames) / frames, times / times[-1], shares), depth)
 
 
 def _speeds(places: Array) -> Array:
@@ -143,7 +143,7 @@ def _speeds(places: Array) -> Array:
     return speeds
 
 
-def tour(extrinsics: Tensor, shares: Array, depth: float) -> Tensor:
+def camera_path(extrinsics: Tensor, shares: Array, depth: float) -> Tensor:
     """A smooth closed path through some cameras, as poses.
 
     The cameras are passed in the order of a short round trip. Between them, positions and quaternions are cubic splines

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kgs.app.files.encoders import RATE
-from kgs.app.files.film import FRAMES, paced
+from kgs.app.files.film import FRAMES, resample_by_speed
 from kgs.geometry import camera_centers, common_up, typical_depths
 
 Array = NDArray[np.float64]
@@ -51,7 +51,7 @@ def viewer_scene(
         pyramid: depth of the pyramids that stand for the cameras, in world units.
         arc: how far around the scene the cameras reach, see `_arc`.
         turned: `up` and `arc` where the pictures are turned clockwise by one, two and three quarters.
-        tour: the rotations and positions of the cameras of the film, see :func:`kgs.app.files.film.paced` (poses), and
+        tour: the rotations and positions of the cameras of the film, see :func:`kgs.app.files.film.resample_by_speed` (poses), and
             its length (seconds).
     """
     positions = camera_centers(cameras.extrinsics).numpy()
@@ -193,7 +193,7 @@ def _widened(low: float, high: float) -> list[float]:
 def _tour(cameras: PinholeCamera, means: Tensor) -> dict[str, Any]:
     """The path of the film through some cameras: `FRAMES` rotations and positions at equal times, and seconds."""
     depth = typical_depths(means, cameras)[1]
-    poses = paced(cameras.extrinsics, FRAMES, depth)
+    poses = resample_by_speed(cameras.extrinsics, FRAMES, depth)
     rotations = poses[:, :3, :3].numpy()
     positions = camera_centers(poses).numpy()
     digits = _DIGITS - math.floor(math.log10(depth))
