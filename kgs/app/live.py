@@ -51,7 +51,7 @@ class LivePage:
         self._shown = float("-inf")  # time of the last splat
         self._seconds = 0.0  # processor time that copies took
         self._server = LiveServer(partial(_alone, live_page, trainer.result(), some, title, roll))
-        self._server.show(self._words(trainer.step, len(trainer.model)), partial(_alone, plain, gaussians))
+        self._server.show(self._words(trainer.step, len(trainer.model)), partial(_alone, pack_float32, gaussians))
         self.url = self._server.url
         self.end = "The fit is done."
 
@@ -88,7 +88,7 @@ class LivePage:
         begin = time.thread_time()
         gaussians = _copied(model)
         self._seconds += time.thread_time() - begin
-        self._server.show(text, partial(_alone, plain, gaussians))
+        self._server.show(text, partial(_alone, pack_float32, gaussians))
 
     def _words(self, step: int, count: int) -> str:
         """As "step 300 of 900, 41 000 Gaussians"."""
