@@ -83,7 +83,7 @@ class Lens:
     project: Callable[[Tensor], Tensor]  # camera points (M, 3) to pixels (M, 2)
     jacobian: Callable[[Tensor], Tensor]  # camera points to the derivative of the pixel, (M, 2, 3)
     parallel: bool = False  # whether all rays have one direction (orthographic)
-    sees: Callable[[Tensor], Tensor] | None = None  # whether camera points lie before the fold, (M,); None: all do
+    in_view: Callable[[Tensor], Tensor] | None = None  # whether camera points lie before the fold, (M,); None: all do
 
 
 def pinhole_cameras(
@@ -297,8 +297,8 @@ def _modelled(cameras: PosedCamera, c: int, frame: Frame) -> Lens:
             points = torch.stack([x, y, z], 1)
         return _reverse_jacobian(pixels, points)
 
-    sees = None if plain else _before_fold(params.tolist(), brown_conrady)
-    return Lens(pose, pixels, jacobian, parallel, sees)
+    in_view = None if plain else _before_fold(params.tolist(), brown_conrady)
+    return Lens(pose, pixels, jacobian, parallel, in_view)
 
 
 def _for_autograd(tensor: Tensor) -> Tensor:

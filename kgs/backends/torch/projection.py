@@ -85,8 +85,8 @@ def _project_one(
     with torch.no_grad():
         depths = times(rotation[2:], gaussians.means)[:, 0] + translation[2]
         ids = ((depths > frustum.near_plane) & finite).nonzero()[:, 0]
-        if lens.sees is not None:
-            inside = lens.sees(times(rotation, select_rows(gaussians.means, ids)) + translation)
+        if lens.in_view is not None:
+            inside = lens.in_view(times(rotation, select_rows(gaussians.means, ids)) + translation)
             ids = select_rows(ids, inside.nonzero()[:, 0])
 
     def footprints(ids: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
