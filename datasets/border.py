@@ -8,8 +8,8 @@ from torch.nn.functional import avg_pool1d
 
 from .scene import Views
 
-WIDEST = 0.02  # of the side, at least `FEWEST_LINES` pixels
-FEWEST_LINES = 3
+WIDEST = 0.02  # of the side, at least `MIN_LINES` pixels
+MIN_LINES = 3
 DARK = 0.8  # share of the brightness farther inside, below which an edge may be a border
 CLEAR = 0.9  # share of the brightness farther inside, from which on a row is no border
 FAINTEST = 0.05  # brightness next to a border; where it is darker a border cannot be told from the scene
@@ -52,7 +52,7 @@ def find_border_mask(images: Tensor) -> Tensor | None:
 def _top_border(bright: Tensor) -> Tensor:
     """The border mask `(K, W)` of the first rows of photos `(V, H, W)`; K is 0 without a border there."""
     height, width = bright.shape[1:]
-    most = max(FEWEST_LINES, round(WIDEST * height))
+    most = max(MIN_LINES, round(WIDEST * height))
     if height <= 2 * most:
         return bright.new_zeros(0, width)
     rows = bright.mean(dim=2)

@@ -13,7 +13,7 @@ from .image_file import Image
 
 Maps = tuple[Image, Image]
 _LONGEST_REMAPPED = 2**15 - 1  # a limit of OpenCV
-_LEAST_WEIGHT = 1e-6  # of a pixel that has a colour of its own
+_MIN_WEIGHT = 1e-6  # of a pixel that has a colour of its own
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def weighted(resample: Callable[[Image], Image], image: Image, weights: Image | 
     seen = resample(image * (weights[..., None] if image.ndim == 3 else weights))
     if image.ndim == 3:
         total = total[..., None]
-    return np.asarray(np.where(total > _LEAST_WEIGHT, seen / np.maximum(total, _LEAST_WEIGHT), plain), np.float32)
+    return np.asarray(np.where(total > _MIN_WEIGHT, seen / np.maximum(total, _MIN_WEIGHT), plain), np.float32)
 
 
 def reduce(image: Image, width: int, height: int, weights: Image | None = None) -> Image:

@@ -9,14 +9,14 @@ from typing import Any, TypeGuard
 
 from .errors import DataError
 
-_MOST_BYTES = 64 * 2**20
+_MAX_BYTES = 64 * 2**20
 
 
 def read_json(path: Path, finite: bool = True) -> dict[str, Any]:
     """Read a JSON object; a DataError if the file is missing, over 64 MiB, no object, or refused by `parse_json`."""
     try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise DataError(path, "", f"is larger than {_MOST_BYTES // 2**20} MiB")
+        if path.stat().st_size > _MAX_BYTES:
+            raise DataError(path, "", f"is larger than {_MAX_BYTES // 2**20} MiB")
         value = parse_json(path.read_bytes(), finite)
     except OSError as error:
         raise DataError(path, "", f"cannot be read ({error.strerror})") from error

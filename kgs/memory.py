@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 _LINE = 64  # bytes of a cache line, at which arrays begin
-_LEAST = 2**16  # smaller blocks are quick to get
-_MOST = 2**26  # larger ones are not kept
+_MIN = 2**16  # smaller blocks are quick to get
+_MAX = 2**26  # larger ones are not kept
 _KEPT = 2**28  # bytes of all free blocks
 _WASTE = 1.5  # a block may be so many times larger than what is wanted
 _MARGIN = 1.1  # new blocks are larger than asked for, because the number of Gaussians grows
@@ -31,7 +31,7 @@ def array(shape: int | tuple[int, ...], dtype: Any = np.float32) -> np.ndarray[A
     kind = np.dtype(dtype)
     count = math.prod(shape) if isinstance(shape, tuple) else int(shape)
     size = count * kind.itemsize
-    if not _LEAST <= size <= _MOST:
+    if not _MIN <= size <= _MAX:
         return np.empty(shape, kind)
     block = _block(size + _LINE)
     flat = np.frombuffer(block.data, kind, count, -block.ctypes.data % _LINE)

@@ -206,15 +206,15 @@ class _Binary:
         self._at += size
         return struct.unpack_from(form, self._data, at)
 
-    def count(self, what: str, least_bytes: int) -> int:
-        """The next 64-bit count, of things that take at least `least_bytes` each."""
+    def count(self, what: str, min_bytes: int) -> int:
+        """The next 64-bit count, of things that take at least `min_bytes` each."""
         (number,) = self.take("<Q", what)
-        self._need(number * least_bytes, what)
+        self._need(number * min_bytes, what)
         return int(number)
 
-    def items(self, what: str, least_bytes: int) -> Iterator[int]:
+    def items(self, what: str, min_bytes: int) -> Iterator[int]:
         """Loop as often as the next count says; after the last item the file has to end."""
-        yield from range(self.count(what, least_bytes))
+        yield from range(self.count(what, min_bytes))
         if self._at != len(self._data):
             raise DataError(self._path, "", f"{len(self._data) - self._at} bytes are left over")
 
@@ -265,11 +265,11 @@ class _Line:
             raise DataError(self._path, f"line {self._line[:60]!r}", f"{len(left)} words are left over")
 
 
-def _records(path: Path, what: str, least_bytes: int) -> Iterator[_Binary | _Line]:
+def _records(path: Path, what: str, min_bytes: int) -> Iterator[_Binary | _Line]:
     """Of each of a file's records what reads it: the file's bytes, or a line."""
     if path.suffix == ".bin":
         data = _Binary(path)
-        for _ in data.items(what, least_bytes):
+        for _ in data.items(what, min_bytes):
             yield data
     else:
         for text in filter(None, _lines(path)):

@@ -31,10 +31,10 @@ from kgs.app.page.fit_page import PAGE, write_own_page
 from kgs.datasets.scene import Scene
 from kgs.errors import DataError, printable
 from kgs.fit.checkpoint import save_checkpoint
-from kgs.fit.config import FitConfig, least_side
+from kgs.fit.config import FitConfig, min_side
 from kgs.fit.fit import Fit
 from kgs.fit.measures import measure
-from kgs.fit.plan import Plan, expected_memory, make_plan, most_gaussians
+from kgs.fit.plan import Plan, expected_memory, make_plan, gaussian_limit
 from kgs.fit.prune import prune
 from kgs.fit.run import choose_points, decide
 from kgs.fit.trainer import Trainer
@@ -167,7 +167,7 @@ def _state(folder: Path) -> str:
 
 def _check_size(scene: Scene, config: FitConfig, lpips: Lpips | None) -> None:
     """A DataError where images are too small for the measures."""
-    smallest = least_side(config, lpips is not None)
+    smallest = min_side(config, lpips is not None)
     for views in (scene.train, scene.test):
         height, width = views.images.shape[-2:]
         if min(height, width) < smallest:
@@ -201,7 +201,7 @@ def _trainer(
     points = choose_points(scene, config, each)
     say(f"initial points: {len(points.points)} ({points.kind})")
     plan = decide(plan, points)
-    memory = expected_memory(scene, most_gaussians(plan.config, len(points.points)))
+    memory = expected_memory(scene, gaussian_limit(plan.config, len(points.points)))
     say(f"the fit takes up to {memory / 2**30:.1f} GiB of memory")
     return Trainer(scene, plan, points), begin(out, "fit")
 

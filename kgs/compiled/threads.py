@@ -8,7 +8,7 @@ from queue import SimpleQueue
 from threading import Thread
 from typing import Any
 
-_LEAST = 8192  # numbers or rows of a range: below that a second thread costs more than it gains
+_MIN = 8192  # numbers or rows of a range: below that a second thread costs more than it gains
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def parallel_for(threads: int, count: int, kernel: Callable[..., None], *argumen
         arguments: of the kernel, behind the range.
         pieces: how many ranges; None goes by `count`.
     """
-    step = max(1, -(-count // (pieces or max(1, min(16, count // _LEAST)))))
+    step = max(1, -(-count // (pieces or max(1, min(16, count // _MIN)))))
     if step >= count:
         if count:
             kernel(0, count, *arguments)

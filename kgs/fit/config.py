@@ -205,7 +205,7 @@ class FitConfig:
         return cls(**{**values, "recipe": Recipe(**recipe)})
 
 
-def least_side(config: FitConfig, lpips: bool) -> int:
+def min_side(config: FitConfig, lpips: bool) -> int:
     """The least pixels of the shorter side of photos in a fit, whose result is measured with or without LPIPS."""
     return max(16 if lpips else 6, 12 if config.coarse else 6)
 

@@ -26,8 +26,8 @@ from kgs.init_points.patches import MIN_PATCHES, PatchColors
 
 from .plan import Plan
 
-LEAST_RATIO = 1.3  # between the gains of two photos in a channel, for gains to be used
-MOST_LEFT = 0.6  # of the median difference of a patch's colours, after the gains, for gains to be used
+MIN_RATIO = 1.3  # between the gains of two photos in a channel, for gains to be used
+MAX_LEFT = 0.6  # of the median difference of a patch's colours, after the gains, for gains to be used
 USABLE = 0.03, 0.97  # colours beyond are black or saturated
 ROUNDS = 8  # of the weights
 PRIOR = 1e-3  # so many imaginary patches have gain 1: they decide where no real one does
@@ -54,7 +54,7 @@ def decide_exposure(plan: Plan, points: InitialPoints) -> Plan:
         return plan
     gains, left = estimate_gains(points.patches)
     ratio = float((gains.amax(0) / gains.amin(0)).max())
-    if how == "auto" and (ratio < LEAST_RATIO or left > MOST_LEFT):
+    if how == "auto" and (ratio < MIN_RATIO or left > MAX_LEFT):
         return plan
     rows = [[round(value, 4) for value in row] for row in gains.tolist()]
     exposure = {"gains": rows, "left": round(left, 3), "n": len(points.patches)}

@@ -19,7 +19,7 @@ WINDOW = 7  # pixels, the side of the square whose darkest colour counts
 HAZE = 0.02  # by which the darkest colour of the render exceeds that of the photo
 FRONT = 0.9  # of the median depth: what is nearer floats before the surface
 FADE = 0.5  # factor of their opacities
-MOST_VIEWS = 12  # that are looked at
+MAX_VIEWS = 12  # that are looked at
 
 
 @torch.no_grad()
@@ -33,7 +33,7 @@ def veils(fit: Fit) -> Tensor:
     found = torch.zeros(len(means), dtype=torch.bool)
     if fit.scene.background.any():
         return found
-    for view in select_evenly(len(views), min(len(views), MOST_VIEWS)):
+    for view in select_evenly(len(views), min(len(views), MAX_VIEWS)):
         shown, photo, _ = views.compared(view, views.render(view, fit.render))
         is_hazy = (darkest(shown[0]) - darkest(photo) > HAZE).cpu()
         surface = fit.median_depth(views.camera(view))

@@ -15,7 +15,7 @@ from .config import DROP
 from .plan import FEW, Plan
 
 STEPS_OF_A_PHOTO = 275  # steps for each photo beyond the third that shows a place
-MOST_STEPS = 1800
+MAX_STEPS = 1800
 FEW_TOGETHER = 3.0  # photos that show two places at once: up to so many the rate is `DROP`
 MANY_TOGETHER = 5.0  # from so many on nothing is dropped
 
@@ -67,7 +67,7 @@ def decide_by_overlap(plan: Plan, points: InitialPoints) -> Plan:
 def steps_for(photos_per_place: float) -> int:
     """The number of steps where so many photos show a place, a multiple of 50; of three as in fits to three."""
     steps = FEW.steps + STEPS_OF_A_PHOTO * (photos_per_place - 3)
-    return min(max(50 * round(steps / 50), FEW.steps), MOST_STEPS)
+    return min(max(50 * round(steps / 50), FEW.steps), MAX_STEPS)
 
 
 def drop_rate_for(photos_per_pair: float) -> float:

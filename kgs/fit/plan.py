@@ -127,7 +127,7 @@ def make_schedule(config: FitConfig) -> Schedule:
     )
 
 
-def most_gaussians(config: FitConfig, points: int) -> int:
+def gaussian_limit(config: FitConfig, points: int) -> int:
     """The number of Gaussians at which densification stops, in a fit from `points` initial points."""
     return config.max_gaussians or max(10 * (config.steps or MANY.steps), 3 * points // 2)
 

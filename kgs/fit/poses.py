@@ -87,8 +87,8 @@ class MovingPoses:
         """How far the cameras moved: mean and maximum, rotations in degrees, shifts as shares of the median depth."""
         degrees = degrees_between(self.extrinsics[:, :3, :3], self.given[:, :3, :3])
         shares = (camera_centers(self.extrinsics) - camera_centers(self.given)).norm(dim=1) / self.depth
-        found = {"degrees": degrees.mean(), "most_degrees": degrees.max()}
-        found |= {"depths": shares.mean(), "most_depths": shares.max()}
+        found = {"degrees": degrees.mean(), "max_degrees": degrees.max()}
+        found |= {"depths": shares.mean(), "max_depths": shares.max()}
         return {name: round(float(value), 5) for name, value in found.items()}
 
     def state_dict(self) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from kgs.model import PARAMETERS, GaussianModel
 
 from .adam import Adam
 from .config import DROP, FitConfig
-from .plan import MANY, Plan, most_gaussians
+from .plan import MANY, Plan, gaussian_limit
 from .poses import MovingPoses
 
 # for each parameter the name of its learning rate in the recipe, without `lr_`
@@ -120,7 +120,7 @@ class TrainState:
             absgrad=recipe.absgrad,
             percent_dense=recipe.percent_dense,
             prune_opacity=recipe.prune_opacity,
-            max_gaussians=most_gaussians(config, start.init["points"]),
+            max_gaussians=gaussian_limit(config, start.init["points"]),
             generator=torch.Generator().manual_seed(seed + 2),
         )
         poses = None

@@ -23,11 +23,11 @@ from .plan import Plan
 
 DEGREE = 3  # of the harmonics that are chosen
 MIN_VIEWS = 4  # training views: three do not determine harmonics
-MOST_PATCHES = 6000  # that are used, to bound the time
+MAX_PATCHES = 6000  # that are used, to bound the time
 TYPICAL = 25.0  # dB
 MIN_GAIN = 0.2  # dB
 ROUNDS = 5  # of the exposures
-MOST_APART = 4.0  # from a patch's median, in medians of all such differences
+MAX_APART = 4.0  # from a patch's median, in medians of all such differences
 FLAT_PRIOR = 1e3  # variance of a patch's colour without its dependence on the direction
 
 
@@ -62,7 +62,7 @@ def decide_degree(plan: Plan, points: InitialPoints) -> Plan:
 
 def possible_gain(patches: PatchColors) -> float:
     """By how many dB harmonics can raise a fit of `TYPICAL` dB; negative where they predict worse than the mean."""
-    rows = select_evenly(len(patches), min(len(patches), MOST_PATCHES))
+    rows = select_evenly(len(patches), min(len(patches), MAX_PATCHES))
     visible = patches.visible[rows]
     colors = _without_outliers(without_exposure(patches.colors, patches.visible)[rows], visible)
     directions = patches.directions[rows]
@@ -96,10 +96,10 @@ def without_exposure(colors: Tensor, visible: Tensor) -> Tensor:
 
 
 def _without_outliers(colors: Tensor, visible: Tensor) -> Tensor:
-    """Colours at most `MOST_APART` typical differences from their patch's median: hidden surfaces have any colour."""
+    """Colours at most `MAX_APART` typical differences from their patch's median: hidden surfaces have any colour."""
     medians = colors.masked_fill(~visible[..., None], math.nan).nanmedian(1, keepdim=True).values
     differences = colors - medians
-    most = MOST_APART * float(differences[visible].abs().median())
+    most = MAX_APART * float(differences[visible].abs().median())
     return medians + differences.clamp(-most, most)
 
 

@@ -27,7 +27,7 @@ AGREEMENT_PIXELS = 0.5
 WINDOW = 5
 SUPPORT = 13
 # Views also agree by chance on small pieces of surface, far from the others. There a pixel needs two other views.
-LEAST_PIECE = 0.001  # of the image's pixels; smaller pieces are small
+MIN_PIECE = 0.001  # of the image's pixels; smaller pieces are small
 JUMP = 0.01  # difference of inverse depths between neighbours at which a piece ends, of the range of all that agree
 AROUND = 0.1  # of the image's width, the side of the window in which a small piece is compared with large ones
 MARGIN = 0.03  # of the range, by which it may lie before or behind all of these
@@ -88,7 +88,7 @@ def _strays(depths: Tensor, mask: Tensor) -> Tensor:
     least = inverse[mask].min()
     shares = ((inverse - least) / (inverse.max() - least).clamp_min(1e-30)).numpy()
     levels = np.where(mask, np.rint(LEVELS * shares), NO_LEVEL).astype(np.int16)
-    cv2.filterSpeckles(levels, NO_LEVEL, int(LEAST_PIECE * mask.numel()), JUMP * LEVELS)
+    cv2.filterSpeckles(levels, NO_LEVEL, int(MIN_PIECE * mask.numel()), JUMP * LEVELS)
     is_large = levels != NO_LEVEL
     side = int(AROUND * mask.shape[1]) // 2 * 2 + 1
     kernel = np.ones((side, side), np.uint8)

@@ -22,20 +22,20 @@ from .patches import PatchColors, patch_colors
 from .plane_sweep import DepthMap, plane_count, planes_wanted, sweep_depths
 
 SCORE = 0.35  # the least matching score of a point; noise reaches 0.3 along a smooth surface
-MOST_PIXELS = 250_000  # of one view
-MOST_PIXELS_OF_ALL = 1_600_000  # of all views together
-MOST_SAMPLES = 350_000_000  # pixels of all views, times the planes of the sweep: bounds its time
+MAX_PIXELS = 250_000  # of one view
+MAX_PIXELS_OF_ALL = 1_600_000  # of all views together
+MAX_SAMPLES = 350_000_000  # pixels of all views, times the planes of the sweep: bounds its time
 SKY = 2.0  # points farther than this times the scene's largest depth belong to the sky
 PER_SKY = 2  # the least number of points of the scene for each point of the sky
 # Pixels by which an image moves from the nearest plane to the farthest one: planes lie at most two pixels apart.
-MOST_SHIFT = 512
+MAX_SHIFT = 512
 SMALLEST = 64  # pixels, the least side of an image that was halved for this
 # The number of points for a count of None: one for so many pixels with an agreed depth, between two limits.
 PIXELS_OF_A_POINT = 3
 FEWEST = 30_000
 MOST = 60_000
 FEW_VIEWS = 3
-MOST_OF_FEW_VIEWS = 90_000  # of up to so few views; with more, such fits take 1.4 times as long
+MAX_OF_FEW_VIEWS = 90_000  # of up to so few views; with more, such fits take 1.4 times as long
 
 
 class DensePoints(NamedTuple):
@@ -64,7 +64,7 @@ def dense_points(
     The scene lies between the depths `near` and `far`; the sky behind it gets points, too.
 
     A `count` of None is one point for every `PIXELS_OF_A_POINT` pixels with an agreed depth, between `FEWEST` and
-    `MOST` (`MOST_OF_FEW_VIEWS`), in images that have together `pixels` pixels, or those of the views.
+    `MOST` (`MAX_OF_FEW_VIEWS`), in images that have together `pixels` pixels, or those of the views.
 
     `draw` is "uniform", or "spread" evenly over the images: one point from each of about as many cells. Points lie
     where the pixels of both views are usable.
@@ -77,7 +77,7 @@ def dense_points(
     points, colors, places = map(torch.cat, zip(*parts, strict=True))
     if count is None:
         agreed = round(pixels * len(points) / views.images[:, 0].numel())
-        most = MOST_OF_FEW_VIEWS if len(views) <= FEW_VIEWS else MOST
+        most = MAX_OF_FEW_VIEWS if len(views) <= FEW_VIEWS else MOST
         count = min(max(agreed // PIXELS_OF_A_POINT, FEWEST), most)
     view, x, y = places.unbind(1)
     is_sky = torch.stack([depth_map.depths for depth_map in maps])[view, y, x] > SKY * far
@@ -91,11 +91,11 @@ def dense_points(
 
 def small_enough(views: Views, near: float, far: float) -> Views:
     """The views, halved until a sweep takes not too long, and its planes are at most two pixels apart."""
-    while views.images[0, 0].numel() > MOST_PIXELS or views.images[:, 0].numel() > MOST_PIXELS_OF_ALL:
+    while views.images[0, 0].numel() > MAX_PIXELS or views.images[:, 0].numel() > MAX_PIXELS_OF_ALL:
         views = views.downsample(2)
     while min(views.images.shape[-2:]) >= 2 * SMALLEST:
         shift = planes_wanted(views, near, far)
-        if shift <= MOST_SHIFT and views.images[:, 0].numel() * plane_count(shift) <= MOST_SAMPLES:
+        if shift <= MAX_SHIFT and views.images[:, 0].numel() * plane_count(shift) <= MAX_SAMPLES:
             break
         views = views.downsample(2)
     return views

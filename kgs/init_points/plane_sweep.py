@@ -18,8 +18,8 @@ from kgs.progress import ProgressBar, silent
 from .sweep_costs import sweep_costs
 
 PLANES = 128  # fewest planes; above, one plane for each pixel by which an image moves
-MOST_PLANES = 256
-MOST_TO_INFINITY = 384  # planes of a sweep to infinity: these bound its memory
+MAX_PLANES = 256
+MAX_TO_INFINITY = 384  # planes of a sweep to infinity: these bound its memory
 NEIGHBOURS = 4  # the most views that a view is compared with
 BASELINE = 0.15  # the best distance of a neighbour, over the depth: shorter is less precise, longer more occluded
 FARTHEST = 100.0  # the largest depth of a sweep to infinity, in units of `far`
@@ -45,7 +45,7 @@ def sweep_depths(
 
     Planes are as far apart as the scene asks for between `near` and `far`. Beyond `far` they go on until one lies
     beyond infinity: an inverse depth below 0, so that infinity is not the last plane. There are at most
-    `MOST_TO_INFINITY`, else farther apart. Depths are at most `FARTHEST` times `far`.
+    `MAX_TO_INFINITY`, else farther apart. Depths are at most `FARTHEST` times `far`.
 
     If all other views are at the place of a view, its depths are unknown and its scores -1.
     """
@@ -54,7 +54,7 @@ def sweep_depths(
     grey = rgb_to_grayscale(views.images.cpu().float())[:, 0]
     planes = plane_count(planes_wanted(views, near, far))
     typical = 2 / (1 / near + 1 / far)
-    spacing = max((1 / near - 1 / far) / (planes - 1), 1 / near / (MOST_TO_INFINITY - 2))
+    spacing = max((1 / near - 1 / far) / (planes - 1), 1 / near / (MAX_TO_INFINITY - 2))
     inverse = 1 / near - spacing * torch.arange(math.ceil(1 / near / spacing) + 2, dtype=torch.float64)
     geometry = ViewGeometry.of(views.cameras)
     memory = torch.empty(2, *grey.shape[1:], len(inverse))
@@ -73,7 +73,7 @@ def sweep_depths(
 
 def plane_count(wanted: float) -> int:
     """The number of planes from `near` to `far` where so many are wanted."""
-    return min(max(math.ceil(wanted), PLANES), MOST_PLANES)
+    return min(max(math.ceil(wanted), PLANES), MAX_PLANES)
 
 
 def planes_wanted(views: Views, near: float, far: float) -> float:

@@ -17,7 +17,7 @@ WINDOW = 7  # pixels, the side of the patches that are compared
 STEP = 0.1
 JUMP = 2.0
 EDGE = 0.02  # the difference of grey values that halves the price of a jump
-LEAST_JUMP = 1.5 * STEP
+MIN_JUMP = 1.5 * STEP
 # A plane may lie outside a neighbour's image. Without a score there, chance matches inside beat the true plane.
 UNSEEN = 0.3  # the score where no neighbour shows the patch; noise reaches as much
 ALONE = 0.6  # the second best score where one neighbour shows it, over that one's
@@ -60,7 +60,7 @@ def _compiled_costs(
     neighbours = torch.nn.functional.pad(others, (0, 1, 0, 1)).numpy()
     constants = tuple(np.float32(constant) for constant in (VARIANCE, UNSEEN, ALONE))
     compare(threads, padded, *moments, constants, neighbours, homographies.numpy(), costs.numpy())
-    prices = tuple(np.float32(price) for price in (STEP, JUMP * EDGE, EDGE, LEAST_JUMP))
+    prices = tuple(np.float32(price) for price in (STEP, JUMP * EDGE, EDGE, MIN_JUMP))
     semi_global(threads, costs.numpy(), image.numpy(), prices, smoothed.numpy())
     return smoothed.permute(2, 0, 1), costs.permute(2, 0, 1)
 
@@ -139,7 +139,7 @@ def _add_paths(cost: Tensor, grey: Tensor, total: Tensor, flip: bool, slant: int
             previous = before.roll(slant, 1)
             edge = (grey[row] - grey[last].roll(slant)).abs()
             least = previous.amin(0)
-            cheapest = torch.minimum(previous, least + (JUMP * EDGE / (EDGE + edge)).clamp_min(LEAST_JUMP))
+            cheapest = torch.minimum(previous, least + (JUMP * EDGE / (EDGE + edge)).clamp_min(MIN_JUMP))
             cheapest[1:] = torch.minimum(cheapest[1:], previous[:-1] + STEP)
             cheapest[:-1] = torch.minimum(cheapest[:-1], previous[1:] + STEP)
             more = cheapest - least

@@ -209,7 +209,7 @@ def add_paths(begin, end, cost, grey, dy, dx, prices, total):
     A path continues that of the same plane, of one beside it for a price, or of any for another, lower at edges.
     """
     height, width, planes = cost.shape
-    step, jump, edge, least_jump = prices
+    step, jump, edge, min_jump = prices
     size = (planes + LANES - 1) // LANES * LANES
     memory = np.full((2, PATHS, size + 2), INFINITY)  # costs of the paths so far, between infinite ones
     lowest = np.empty(PATHS, np.float32)  # of each path
@@ -234,7 +234,7 @@ def add_paths(begin, end, cost, grey, dy, dx, prices, total):
                     slope = abs(grey[y, x] - grey[y - dy, x - dx])
                     least = lowest[k]
                     price = ONE / (edge + slope) * jump
-                    anywhere = least + (price if price > least_jump else least_jump)
+                    anywhere = least + (price if price > min_jump else min_jump)
                     for d in range(planes):
                         cheapest = previous[1 + d] if previous[1 + d] < anywhere else anywhere
                         left, right = previous[d] + step, previous[2 + d] + step

@@ -33,7 +33,7 @@ REPORT = {
     "photos": {"a.jpg": {"points": 70, "blurred": True}, "b.jpg": {"points": 90, "blurred": False}},
     "matches": [["a.jpg", "b.jpg", 123]],
     "focal_px": 123.456,
-    "gates": {"most_degrees": 2.0, "passed": True},
+    "gates": {"max_degrees": 2.0, "passed": True},
     "seconds": {"matches": 3.0, "cameras": 1.5},
     "sha256": ["0123abcd"],
 }

@@ -19,7 +19,7 @@ import kgs
 from kgs.app.files.plot import psnr_plot
 from kgs.app.page import PageContent, PagePhotos, PageSplat, PageText, Picture, write_page
 from kgs.app.page.figures import facts, measure_table, verdict, without_folders
-from kgs.app.page.write import MOST_BYTES
+from kgs.app.page.write import MAX_BYTES
 
 SIZE = (24, 32)
 GAUSSIANS = random_gaussians(1000, 0, torch.float32, sh_degree=1)
@@ -41,8 +41,8 @@ def content(pictures: list[Picture] | None = None, **words: Any) -> PageContent:
     )
 
 
-def write(path: Path, most_bytes: int = MOST_BYTES, **parts: Any) -> str:
-    write_page(path, content(**parts), most_bytes)
+def write(path: Path, max_bytes: int = MAX_BYTES, **parts: Any) -> str:
+    write_page(path, content(**parts), max_bytes)
     return path.read_text(encoding="utf-8")
 
 
@@ -132,11 +132,11 @@ def test_a_page_says_its_size_and_keeps_to_its_limit(tmp_path: Path) -> None:
     text = write(path)
     assert f"This page has {len(path.read_bytes()) / 1e6:.2f} MB" in text
     smaller = len(path.read_bytes()) - 10_000
-    text = write(path, most_bytes=smaller)
+    text = write(path, max_bytes=smaller)
     assert len(path.read_bytes()) <= smaller
     assert "This page shows 8-bit numbers" in text
     with pytest.raises(ValueError, match="expected room for a Gaussian"):
-        write(path, most_bytes=10_000)
+        write(path, max_bytes=10_000)
 
 
 def test_a_photo_without_a_render_has_words_on_exif_and_no_slider(tmp_path: Path) -> None:

@@ -148,7 +148,7 @@ def test_cameras_that_see_nothing_are_named(splat, llff, tmp_path, capsys):
 def test_a_page_of_any_splat(splat, llff, tmp_path, capsys, monkeypatch):
     out, decoded, plain = tmp_path / "page.html", [], ImageFile.read
     monkeypatch.setattr(ImageFile, "read", lambda file: decoded.append(file.path.name) or plain(file))
-    monkeypatch.setattr(pictures, "MOST_THUMBNAILS", 4)
+    monkeypatch.setattr(pictures, "MAX_THUMBNAILS", 4)
     page(splat, cameras=llff, out=out)
     text = out.read_text(encoding="utf-8")
     assert len(decoded) == 6 + 4  # of ten, and those of the strip: there may be hundreds

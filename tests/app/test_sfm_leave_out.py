@@ -12,7 +12,7 @@ from kornia.geometry.camera import PinholeCamera
 from photo_folders import exif, planes, with_exif
 
 from kgs.app.sfm import pose_photos
-from kgs.app.sfm.gates import MOST_DEGREES, gap
+from kgs.app.sfm.gates import MAX_DEGREES, gap
 from kgs.app.sfm.leave_out import unlike_others, without_cameras, without_overlap
 from kgs.app.sfm.map import Cameras, PairGeometry
 from kgs.app.sfm.match import lenses_of
@@ -64,9 +64,9 @@ def test_three_photos_remain_and_more_than_in_any_other_group():
         (cameras(NAMES[1:]), cameras(NAMES[:5]), "af", "only one of two solvers"),
         (cameras(points={"c": 49}), cameras(points={"c": 20}), "c", "only 49 points"),
         (cameras(points={"c": 49}), cameras(), "", ""),  # one solver sees it well, the other confirms it
-        (cameras(), cameras(turned={"d": 2 * MOST_DEGREES}), "d", "4 degrees apart"),
+        (cameras(), cameras(turned={"d": 2 * MAX_DEGREES}), "d", "4 degrees apart"),
         (cameras(), cameras(turned={"d": 40.0, "e": 80.0}), "de", "degrees apart"),
-        (cameras(), cameras(turned={"d": 0.9 * MOST_DEGREES}), "", ""),
+        (cameras(), cameras(turned={"d": 0.9 * MAX_DEGREES}), "", ""),
         (cameras(NAMES[1:]), cameras(NAMES[1:], turned={"d": 40.0}), "a", "neither"),  # d is looked at without a
         (cameras(), cameras(turned={n: 10.0 * i for i, n in enumerate(NAMES)}), "", ""),  # no three agree
         (cameras(NAMES[:4]), cameras(NAMES[2:]), "", ""),  # two would remain

@@ -268,7 +268,7 @@ def test_what_takes_a_splat_takes_flat_discs_and_opacities_of_one_and_zero(tmp_p
     views = Views(camera, torch.rand(1, 3, 40, 48), ("0.png",))
     save_glb(tmp_path / "a.glb", model, torch.eye(3))
     save_compressed_ply(tmp_path / "a.compressed.ply", model)
-    assert pack(model(), camera, most_bytes=10**6).layout["count"] == len(model) - 1  # one is invisible
+    assert pack(model(), camera, max_bytes=10**6).layout["count"] == len(model) - 1  # one is invisible
     weights = contributions(model, views, RasterOptions(near_plane=0.01))
     assert weights.isfinite().all()
     assert weights[2] > 0

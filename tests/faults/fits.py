@@ -139,7 +139,7 @@ def _memory_of(points: Path, steps: int) -> tuple[float, int, int]:
     import torch
 
     from kgs.datasets import synthetic_scene
-    from kgs.fit.plan import make_plan, most_gaussians
+    from kgs.fit.plan import make_plan, gaussian_limit
     from kgs.fit.run import choose_points
     from kgs.fit.trainer import Trainer
 
@@ -161,7 +161,7 @@ def _memory_of(points: Path, steps: int) -> tuple[float, int, int]:
     photos = scene.train.images
     images = 40 * photos[:1].nbytes + 4 * photos.nbytes  # those of the loss, and copies
     # what libraries load at first use; parameters, gradients, moments and copies of each Gaussian
-    ceiling = config.max_bytes + 96 * 2**20 + 4096 * most_gaussians(config, len(points.points)) + images
+    ceiling = config.max_bytes + 96 * 2**20 + 4096 * gaussian_limit(config, len(points.points)) + images
     return slope / 1024, max(resident) - before, ceiling
 
 

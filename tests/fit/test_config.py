@@ -13,7 +13,7 @@ import torch
 from kgs import RasterOptions
 from kgs.datasets import synthetic_scene
 from kgs.fit.config import PAPER, PRESETS, FitConfig, Recipe
-from kgs.fit.plan import expected_memory, make_plan, most_gaussians, make_schedule, with_step_defaults
+from kgs.fit.plan import expected_memory, make_plan, gaussian_limit, make_schedule, with_step_defaults
 
 
 @pytest.mark.parametrize(
@@ -136,9 +136,9 @@ def test_more_gaussians_or_pixels_take_more_memory():
     larger = synthetic_scene(train_views=2, test_views=0, size=(32, 32))
     assert expected_memory(SCENE, 1000) < expected_memory(SCENE, 10**6)
     assert expected_memory(SCENE, 1000) < expected_memory(larger, 1000)
-    assert most_gaussians(FitConfig(max_gaussians=7), 100) == 7
-    assert most_gaussians(FitConfig(steps=100), 100) == 1000
-    assert most_gaussians(FitConfig(steps=100), 10_000) == 15_000
+    assert gaussian_limit(FitConfig(max_gaussians=7), 100) == 7
+    assert gaussian_limit(FitConfig(steps=100), 100) == 1000
+    assert gaussian_limit(FitConfig(steps=100), 10_000) == 15_000
 
 
 def test_the_memory_of_a_render_is_bounded_as_without_a_fit():

@@ -12,7 +12,7 @@ from kgs.app.page import fit_page
 from kgs.datasets import synthetic_scene
 from kgs.fit import Fit
 from kgs.fit.config import PRESETS, FitConfig
-from kgs.fit.exposure import LEAST_RATIO, decide_exposure, estimate_gains, with_exposure
+from kgs.fit.exposure import MIN_RATIO, decide_exposure, estimate_gains, with_exposure
 from kgs.fit.measures import measure
 from kgs.fit.plan import make_plan
 from kgs.fit.prune import psnr_per_view
@@ -73,7 +73,7 @@ def test_gains_are_used_only_where_photos_differ(tiny_plan):
     assert decide_exposure(same, points_with(patches())) == same
     assert decide_exposure(tiny_plan, points_with(patches(1 + 0.04 * (GAINS - 1), noise=0.1))) == tiny_plan
     warm = torch.ones(4, 3)
-    warm[0, 0] = 1.1 * LEAST_RATIO
+    warm[0, 0] = 1.1 * MIN_RATIO
     each = replace(tiny_plan, config=replace(tiny_plan.config, exposure="each"))
     assert "exposure" in decide_exposure(each, points_with(patches(equal))).decisions
     decisions = decide_exposure(tiny_plan, points_with(patches(warm))).decisions["exposure"]

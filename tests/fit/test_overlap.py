@@ -12,7 +12,7 @@ from kgs.fit.config import DROP, FitConfig
 from kgs.fit.overlap import (
     FEW_TOGETHER,
     MANY_TOGETHER,
-    MOST_STEPS,
+    MAX_STEPS,
     Overlap,
     decide_by_overlap,
     drop_rate_for,
@@ -49,7 +49,7 @@ def test_steps_rise_and_the_rate_falls_with_the_photos_that_show_the_same_places
     rates = [drop_rate_for(n) for n in photos]
     assert steps == sorted(steps)
     assert rates == sorted(rates, reverse=True)
-    assert (steps_for(1.0), steps_for(3.0), steps_for(12.0)) == (FEW.steps, FEW.steps, MOST_STEPS)
+    assert (steps_for(1.0), steps_for(3.0), steps_for(12.0)) == (FEW.steps, FEW.steps, MAX_STEPS)
     assert (drop_rate_for(FEW_TOGETHER), drop_rate_for(MANY_TOGETHER)) == (DROP, 0.0)
     assert 0 < drop_rate_for(0.5 * (FEW_TOGETHER + MANY_TOGETHER)) < DROP
 

@@ -98,7 +98,7 @@ def test_none_goes_farther_than_its_reach(room):
         camera = poses.camera(room.train.camera(step % 3), step % 3)
         (1e12 * camera.extrinsics[0, 0, 2]).backward()
         poses.step(room, (step + 1) / 90)
-    assert poses.moved()["most_degrees"] < math.degrees(2 * 3**0.5 * REACH)
+    assert poses.moved()["max_degrees"] < math.degrees(2 * 3**0.5 * REACH)
     orthogonal = poses.extrinsics[:, :3, :3] @ poses.extrinsics[:, :3, :3].mT
     torch.testing.assert_close(
         orthogonal, torch.eye(3, dtype=torch.float64).expand(3, 3, 3), rtol=0, atol=1e-6
@@ -112,7 +112,7 @@ def test_no_step_without_a_finite_gradient(room, slope):
     if slope is not None:
         (slope * camera.extrinsics.sum()).backward()
     assert poses.step(room, 0.2) is room
-    assert poses.moved()["most_degrees"] == 0
+    assert poses.moved()["max_degrees"] == 0
 
 
 @pytest.mark.slow
@@ -170,7 +170,7 @@ def test_files_are_about_the_moved_cameras(refined):
     metrics = json.loads((out / "metrics.json").read_text())
     scene = load_fit(out)[1].scene
     given = load_scene(root).train.cameras.extrinsics
-    assert 0 < metrics["poses"]["degrees"] <= metrics["poses"]["most_degrees"]
+    assert 0 < metrics["poses"]["degrees"] <= metrics["poses"]["max_degrees"]
     listed = json.loads((out / "cameras.json").read_text())[: len(given)]
     places = torch.tensor([entry["position"] for entry in listed]) - scene.offset
     torch.testing.assert_close(places, camera_centers(scene.train.cameras.extrinsics), rtol=0, atol=1e-6)

@@ -19,7 +19,7 @@ from kgs.fit.plan import make_plan
 from kgs.init_points import InitialPoints
 
 CPU = torch.device("cpu")
-MOST_LAUNCHES, MOST_WAITS = 150, 4  # of a training step on a GPU
+MAX_LAUNCHES, MAX_WAITS = 150, 4  # of a training step on a GPU
 # operators that compute nothing, and those that wait for a number
 _FREE = (
     "alias as_strided detach empty empty_like empty_strided expand lift_fresh new_empty permute reshape select slice"
@@ -67,8 +67,8 @@ def test_a_step_is_few_launches_and_waits(scene, few, monkeypatch):
     only_here = 2  # the layer looks at opacities where that costs nothing
     waited = len(waits) + sum(found[name] for name in _WAITS) - only_here
     assert sum(kernels.values()) >= 10
-    assert sum(kernels.values()) + calls <= MOST_LAUNCHES
-    assert 1 <= waited <= MOST_WAITS
+    assert sum(kernels.values()) + calls <= MAX_LAUNCHES
+    assert 1 <= waited <= MAX_WAITS
 
 
 def test_a_resumed_fit_on_another_kind_of_device_draws_anew_and_says_so(scene, few):

@@ -67,7 +67,7 @@ def test_depths_that_differ_by_chance_do_not_agree() -> None:
 def test_a_small_piece_before_its_surroundings_needs_two_other_views(
     confirming: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(agreement, "LEAST_PIECE", 2 * SQUARE**2 / EVERYWHERE.numel())
+    monkeypatch.setattr(agreement, "MIN_PIECE", 2 * SQUARE**2 / EVERYWHERE.numel())
     monkeypatch.setattr(agreement, "AROUND", 3 * SQUARE / WIDTH)
     beside = cameras(np.array([[0.0, 0.0, 0.0], [0.4, 0.0, 0.0], [-0.4, 0.0, 0.0]]), turn=0.0, size=(WIDTH, HEIGHT))
     maps = [wall(DEPTH) for _ in range(3)]
@@ -81,7 +81,7 @@ def test_a_small_piece_before_its_surroundings_needs_two_other_views(
 
 
 def test_small_pieces_at_the_depths_around_them_stay(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(agreement, "LEAST_PIECE", 2 * SQUARE**2 / EVERYWHERE.numel())
+    monkeypatch.setattr(agreement, "MIN_PIECE", 2 * SQUARE**2 / EVERYWHERE.numel())
     monkeypatch.setattr(agreement, "AROUND", 0.5)
     certain = torch.zeros_like(EVERYWHERE)
     certain[:10] = True

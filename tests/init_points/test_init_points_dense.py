@@ -286,12 +286,12 @@ def test_views_are_halved_until_planes_lie_close_together(views: Views, monkeypa
     shift = planes_wanted(views, 2.0, 10.0)
     monkeypatch.setattr(dense, "SMALLEST", 8)
     for bound, halvings in ((1.01, 0), (0.99, 1), (0.49, 2)):
-        monkeypatch.setattr(dense, "MOST_SHIFT", bound * shift)
+        monkeypatch.setattr(dense, "MAX_SHIFT", bound * shift)
         assert small_enough(views, 2.0, 10.0).images.shape[-1] == width // 2**halvings
-    monkeypatch.setattr(dense, "MOST_SHIFT", math.inf)
+    monkeypatch.setattr(dense, "MAX_SHIFT", math.inf)
     samples = views.images[:, 0].numel() * plane_count(shift)
     for most, halvings in ((samples, 0), (samples - 1, 1)):
-        monkeypatch.setattr(dense, "MOST_SAMPLES", most)
+        monkeypatch.setattr(dense, "MAX_SAMPLES", most)
         assert small_enough(views, 2.0, 10.0).images.shape[-1] == width // 2**halvings
-    monkeypatch.setattr(dense, "MOST_PIXELS", views.images[0, 0].numel() // 2)
+    monkeypatch.setattr(dense, "MAX_PIXELS", views.images[0, 0].numel() // 2)
     assert small_enough(views, 2.0, 10.0).images.shape[-1] == width // 2

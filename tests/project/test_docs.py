@@ -19,10 +19,10 @@ from tiny_scenes import narrow_lpips
 import kgs
 from kgs.fit.config import DETAILS, DROP, PRESETS, FitConfig
 from kgs.fit.haze import FRONT, HAZE, WINDOW
-from kgs.fit.overlap import MOST_STEPS, STEPS_OF_A_PHOTO
+from kgs.fit.overlap import MAX_STEPS, STEPS_OF_A_PHOTO
 from kgs.fit.plan import MANY as USUAL
 from kgs.fit.plan import with_step_defaults
-from kgs.init_points.dense import FEWEST, MOST, MOST_OF_FEW_VIEWS, PIXELS_OF_A_POINT
+from kgs.init_points.dense import FEWEST, MOST, MAX_OF_FEW_VIEWS, PIXELS_OF_A_POINT
 from kgs.metrics.lpips import Lpips
 
 ROOT = Path(__file__).parents[2]
@@ -93,7 +93,7 @@ def test_the_examples_of_docstrings_do_what_they_say(module, tmp_path, monkeypat
 
 AUTO, PAPER, LOW, HIGH = FitConfig(), PRESETS["paper"], DETAILS["low"], DETAILS["high"]
 FEW, MANY = with_step_defaults(AUTO, 3), with_step_defaults(AUTO, 4)  # the default for up to three views, and for more
-STEPS_OF_BOTH = [FEW.steps, MOST_STEPS]
+STEPS_OF_BOTH = [FEW.steps, MAX_STEPS]
 # A page, what it says with a # for each number, and these numbers.
 NUMBERS = [
     ("README.md", "DropGaussian(p=#)", [PAPER.drop]),
@@ -101,12 +101,12 @@ NUMBERS = [
     ("docs/layer.md", "The paper has p = #", [PAPER.drop]),
     ("docs/layer.md", "is p = #, with nothing dropped in the last #", [DROP, AUTO.no_drop_steps]),
     ("docs/comparison.md", "steps of a full run | # for up to three photos, up to # for more", STEPS_OF_BOTH),
-    ("docs/comparison.md", "initial points, of which there are # to #, or #", [FEWEST, MOST, MOST_OF_FEW_VIEWS]),
+    ("docs/comparison.md", "initial points, of which there are # to #, or #", [FEWEST, MOST, MAX_OF_FEW_VIEWS]),
     ("docs/how-to-photograph.md", "A fit takes # steps for up to three photos and [up to # for more", STEPS_OF_BOTH),
     ("docs/measured.md", "three seeds): # steps from # of the same", [PAPER.steps, PAPER.init_points]),
     ("docs/command.md", "| low | # | # | #, the", [LOW.size, LOW.entries["init_points"], LOW.entries["steps"]]),
     ("docs/command.md", "# to #, one for every # pixels", [FEWEST, MOST, PIXELS_OF_A_POINT]),
-    ("docs/command.md", "three photos to # | # for up to three photos, for", [MOST_OF_FEW_VIEWS, FEW.steps]),
+    ("docs/command.md", "three photos to # | # for up to three photos, for", [MAX_OF_FEW_VIEWS, FEW.steps]),
     ("docs/command.md", "for more [# to #]", STEPS_OF_BOTH),
     ("docs/command.md", "| normal | # for unposed", [DETAILS["normal"].size]),
     ("docs/how-to-photograph.md", "and fitted at # on a CPU", [DETAILS["normal"].size]),
@@ -116,14 +116,14 @@ NUMBERS = [
     ("docs/recipe.md", "times # (up to three", [FEW.recipe.opacity_decay]),
     ("docs/recipe.md", "or # after every step, from # % of", [MANY.recipe.opacity_decay, 100 * AUTO.recipe.decay_from]),
     ("docs/recipe.md", "| steps | #, here # | # for up", [PAPER.recipe.steps, PAPER.steps, FEW.steps]),
-    ("docs/recipe.md", "for up to three photos; for more, up to #", [MOST_STEPS]),
+    ("docs/recipe.md", "for up to three photos; for more, up to #", [MAX_STEPS]),
     ("docs/recipe.md", "**Steps**: #, and # more for each", [FEW.steps, STEPS_OF_A_PHOTO]),
     ("docs/recipe.md", "have no patches: then there are # steps", [USUAL.steps]),
     ("docs/recipe.md", "by # in a window of #x7", [HAZE, WINDOW]),
     ("docs/recipe.md", "lie nearer than # times the median", [FRONT]),
     ("docs/recipe.md", "| initial points | # of", [PAPER.init_points]),
     ("docs/recipe.md", "every # pixels on whose depth two views agree, # to #", [PIXELS_OF_A_POINT, FEWEST, MOST]),
-    ("docs/recipe.md", "(up to three photos to #), each", [MOST_OF_FEW_VIEWS]),
+    ("docs/recipe.md", "(up to three photos to #), each", [MAX_OF_FEW_VIEWS]),
     ("docs/recipe.md", "| scales #, quaternions # | scales", [PAPER.recipe.lr_scales, PAPER.recipe.lr_quats]),
     ("docs/recipe.md", "| scales #, quaternions # | in", [AUTO.recipe.lr_scales, AUTO.recipe.lr_quats]),
     ("docs/recipe.md", "L1 + # (1 - SSIM) | L1 + # (1", [PAPER.recipe.dssim_weight, AUTO.recipe.dssim_weight]),

@@ -116,11 +116,11 @@ def check_photos(
         frames: to be taken from a video.
         shortest: least pixels of the shorter side in the fit.
     """
-    from kgs.app.sfm.find import MOST_FRAMES, find_photos, find_video
+    from kgs.app.sfm.find import MAX_FRAMES, find_photos, find_video
     from kgs.app.sfm.place import check_place
 
     if find_video(folder):
-        _check_views(views, hold_out, MOST_FRAMES if frames is None else frames, "frames")
+        _check_views(views, hold_out, MAX_FRAMES if frames is None else frames, "frames")
         return
     paths = find_photos(folder)
     check_place(out, folder)

@@ -12,7 +12,7 @@ import tyro
 
 from kgs.app.console import VIEWER, as_line, say, say_next
 from kgs.errors import DataError, printable
-from kgs.fit.config import COARSE, DETAILS, PRESETS, Background, FitConfig, least_side
+from kgs.fit.config import COARSE, DETAILS, PRESETS, Background, FitConfig, min_side
 
 from .options import Existing, Out, options_in
 
@@ -237,7 +237,7 @@ def check_fit(
                 "init: expected another one for photos without camera poses, got 'scene', Blender's points"
             )
         assert not isinstance(size, str)
-        shortest = least_side(config, lpips_weights is not None)
+        shortest = min_side(config, lpips_weights is not None)
         check_photos(scene, out, views, hold_out, size, downscale, frames, shortest)
     else:
         check_scene(scene)

@@ -47,7 +47,7 @@ def page(
         backend: auto: the fastest that is installed. kgs fit --help-all describes the others.
     """
     from kgs.app.files.publishing import replacing
-    from kgs.app.page.fit_page import MOST_PICTURES, load_small, spread, write_fit_page
+    from kgs.app.page.fit_page import MAX_PICTURES, load_small, spread, write_fit_page
     from kgs.datasets import load_scene
     from kgs.losses.photometric import WINDOW
     from kgs.machine import check_tools, versions
@@ -59,7 +59,7 @@ def page(
     if min(height, width) < WINDOW:
         raise ValueError(f"downscale: expected photos of at least {WINDOW} pixels a side, got {width}x{height}")
     fit = load_splat(ply, scene, place, backend)
-    few = spread(len(scene.train), MOST_PICTURES)
+    few = spread(len(scene.train), MAX_PICTURES)
     photographed = load_scene(cameras, len(few), downscale, hold_out=0, background=background)
     pictured = in_frame_of(scene, photographed)
     fit = replace(fit, metrics={"views": evaluate(fit.render, pictured), "versions": versions()})

@@ -30,7 +30,7 @@ _HIDDEN = re.compile(r"\.kgs-[0-9a-f]{32}")  # those that do not
 _TEMPORARY = re.compile(r"\.kgs-[0-9a-f]{32}\.tmp")  # files of `write_whole`, which a kill leaves
 _LOCK = ".lock"
 _MARKER_LOCK = ".kgs.lock"
-_MOST_NAMED = 10  # files in a line
+_MAX_NAMED = 10  # files in a line
 Hashes = dict[str, list[str]]  # of each file that kgs wrote; two where new results are about to replace former ones
 Say = Callable[[str], None]
 
@@ -220,7 +220,7 @@ def _move(work: Path, out: Path, all_former: bool, say: Say) -> None:
     kept = [_keep(out, path) for path in dict.fromkeys(blocked)]
     if kept:
         reason = "because this command did not write it, or it was changed since"
-        say(f"{printable(out)}: moved to {listed(kept, _MOST_NAMED)}, {reason}")
+        say(f"{printable(out)}: moved to {listed(kept, _MAX_NAMED)}, {reason}")
     for name in waiting:
         (out / name).parent.mkdir(parents=True, exist_ok=True)
         os.replace(work / name, out / name)

@@ -17,7 +17,7 @@ from kgs.geometry import camera_centers, common_up, typical_depths
 Array = NDArray[np.float64]
 _PYRAMID = 0.3  # depth of a pyramid, as a share of the median distance between neighbouring cameras
 _LARGEST_PYRAMID = 0.1  # its upper bound, as a share of the median depth of the scene
-_LEAST_ARC = 0.3  # radians
+_MIN_ARC = 0.3  # radians
 _RING_GAP = 2 * math.pi / 3  # cameras with smaller gaps between them surround the scene
 _DIGITS = 6  # of a position, after the point, in depths of the scene
 
@@ -185,8 +185,8 @@ def _turned(extrinsics: Tensor, quarters: int, positions: Array, first: int, dis
 
 
 def _widened(low: float, high: float) -> list[float]:
-    """Both ends of an arc, at least `_LEAST_ARC` apart."""
-    more = max(0.0, _LEAST_ARC - (high - low)) / 2
+    """Both ends of an arc, at least `_MIN_ARC` apart."""
+    more = max(0.0, _MIN_ARC - (high - low)) / 2
     return [low - more, high + more]
 
 

@@ -35,10 +35,10 @@ FINE = 16  # bits per number
 COARSE = 8  # bits per number, where the limit of size asks for it
 _POSITION_BITS = 8, 48  # fewest and most bits of a coordinate
 _STRAY = 1e5  # times the median distance from the middle: no sky is so far away
-_MOST_COEFFICIENT = 1e4  # larger ones are lowered to this one, with which a colour is white or black, too
+_MAX_COEFFICIENT = 1e4  # larger ones are lowered to this one, with which a colour is white or black, too
 _BULK = 0.99  # share of the values of a column whose digits are kept whatever the others are
-_MOST_SPREAD = 8.0  # times the range of these values: what the whole range may be without more bits
-_MOST_BITS = 48  # of any number: JavaScript has whole numbers of 53
+_MAX_SPREAD = 8.0  # times the range of these values: what the whole range may be without more bits
+_MAX_BITS = 48  # of any number: JavaScript has whole numbers of 53
 _MIN_SCALE = 1e-12  # smaller scales are raised to this one, whose logarithm is finite
 _CELL_BITS = 16  # bits per axis of the cells that sort Gaussians by their place
 _GZIP_HEADER = b"\x1f\x8b\x08" + bytes(6) + b"\xff"  # without file name, time and operating system
@@ -80,11 +80,11 @@ class Column(NamedTuple):
 def pack(
     gaussians: Gaussians,
     cameras: PinholeCamera,
-    most_bytes: int,
+    max_bytes: int,
     weights: Callable[[], Tensor] | None = None,
     near_plane: float = RasterOptions.near_plane,
 ) -> Packed:
-    """Pack Gaussians into at most `most_bytes` bytes.
+    """Pack Gaussians into at most `max_bytes` bytes.
 
     Invisible Gaussians are always left out: those that are not finite, or have an opacity below the alpha threshold. So
     are strays, which are more than 100 000 times as far from the middle as Gaussians or cameras are in the median; what
@@ -94,7 +94,7 @@ def pack(
     Args:
         gaussians: with harmonics, or RGB colours `(N, 3)`.
         cameras: the cameras of the page. Positions get as many bits as their images need, see `PIXEL_ERROR`.
-        most_bytes: limit for the content of the result.
+        max_bytes: limit for the content of the result.
         weights: returns the contribution of each Gaussian, `(N,)`; those with the smallest are left out first. It is
             called only if Gaussians must be left out. None: opacity times area.
         near_plane: of the renderer, in world units.
@@ -113,15 +113,15 @@ def pack(
     packed = Packed({}, b"")
     reductions = list[str]()
     for packed, reductions in _with_all_gaussians(values, cameras, near_plane, degree):
-        if len(packed.content) <= most_bytes:
+        if len(packed.content) <= max_bytes:
             return packed._replace(left_out=", ".join(words + reductions))
     contributions = _opacity_times_area(values) if weights is None else weights().detach().cpu().double().numpy()[rows]
     order = np.argsort(-contributions, kind="stable")
     count = len(rows)
-    while len(packed.content) > most_bytes:
-        count = min(count - 1, math.floor(_TARGET_SHARE * count * most_bytes / len(packed.content)))
+    while len(packed.content) > max_bytes:
+        count = min(count - 1, math.floor(_TARGET_SHARE * count * max_bytes / len(packed.content)))
         if count < 1:
-            raise ValueError(f"most_bytes: expected room for a Gaussian, got {most_bytes} bytes")
+            raise ValueError(f"max_bytes: expected room for a Gaussian, got {max_bytes} bytes")
         chosen = {name: value[order[:count]] for name, value in values.items()}
         packed = _gzip(_compressed_columns(chosen, cameras, near_plane, COARSE, 0), 0)
     words += [*reductions, f"{count} of {len(rows)} Gaussians"]
@@ -149,7 +149,7 @@ def _visible(gaussians: Gaussians) -> tuple[dict[str, NDArray[Any]], NDArray[np.
     finite = finite_gaussians(gaussians).cpu().numpy()
     rows = np.flatnonzero(finite & (values["opacities"].astype(np.float64) >= RasterOptions.alpha_threshold))
     values = {name: value[rows] for name, value in values.items()}
-    values["colors"] = values["colors"].clip(-_MOST_COEFFICIENT, _MOST_COEFFICIENT)
+    values["colors"] = values["colors"].clip(-_MAX_COEFFICIENT, _MAX_COEFFICIENT)
     return values, rows
 
 
@@ -214,12 +214,12 @@ def _gzip(columns: list[tuple[Column, bytes]], degree: int) -> Packed:
 def _columns(values: dict[str, Array], pixels_per_unit: float, bits: int, degree: int) -> Iterator[Column]:
     """All numbers of the Gaussians in fixed point, the harmonics last."""
     largest_step = 2 * PIXEL_ERROR / math.sqrt(3) / max(pixels_per_unit, 1e-12)
-    least_bits, most_bits = _POSITION_BITS
+    min_bits, max_bits = _POSITION_BITS
     for name, column in _numbers(values, degree):
         if name in ("x", "y", "z"):
             span = float(np.ptp(column)) if len(column) else 0.0
             needed = math.ceil(math.log2(span / largest_step + 2))
-            yield _spread_out(name, column, min(most_bits, max(least_bits, needed)))
+            yield _spread_out(name, column, min(max_bits, max(min_bits, needed)))
         elif name == "largest":
             yield Column(name, 1, 0.0, 1.0, column.astype(np.uint64))
         else:
@@ -256,9 +256,9 @@ def _fixed_point(name: str, values: Array, bits: int) -> Column:
     if not len(values):
         return _spread_out(name, values, bits)
     bulk = 2 * float(np.quantile(np.abs(values - np.median(values)), _BULK, method="lower"))
-    spread = float(np.ptp(values)) / (_MOST_SPREAD * bulk) if bulk > 0 else 0.0
+    spread = float(np.ptp(values)) / (_MAX_SPREAD * bulk) if bulk > 0 else 0.0
     more = math.ceil(math.log2(spread)) if spread > 1 else 0
-    return _spread_out(name, values, min(_MOST_BITS, bits + more))
+    return _spread_out(name, values, min(_MAX_BITS, bits + more))
 
 
 def _spread_out(name: str, values: Array, bits: int) -> Column:

@@ -32,7 +32,7 @@ from .pictures import Picture, in_strip
 from .write import live_html, write_page
 
 PAGE = "index.html"
-MOST_PICTURES = 6  # photos that are shown beside their renders
+MAX_PICTURES = 6  # photos that are shown beside their renders
 _SMALL_PIXELS = 192  # of the shorter side of a photo that becomes a thumbnail
 _BORDER = 0.03  # of the shorter side of a photo: the band whose mean is the ground of the viewer
 
@@ -58,7 +58,7 @@ def write_fit_page(
         path: the file to write.
         title: of the page.
         fits: of one scene, with metrics, by the name of the run; "" for a single one.
-        beside: the views to show beside their renders; only these need pixels. None: up to `MOST_PICTURES` test views,
+        beside: the views to show beside their renders; only these need pixels. None: up to `MAX_PICTURES` test views,
             or training views if there are no test views.
         words: what training and test views are called.
         notes: sentences to show below the one that says how good the fit is.
@@ -81,7 +81,7 @@ def write_fit_page(
     else:
         views = scene.train
         word = training_word
-    photographed = beside or views.select(spread(len(views), MOST_PICTURES))
+    photographed = beside or views.select(spread(len(views), MAX_PICTURES))
     pictured = shown(photographed, roll) if photos else []
     parts = [*shown(scene.train, roll), *shown(scene.test, roll)]
     thumbnailed = [] if not photos else parts if small is None else shown(small, roll)
@@ -171,7 +171,7 @@ def live_page(fit: Fit, gaussians: Gaussians, title: str, roll: float = 0.0) -> 
     """
     scene = fit.scene
     views = scene.test if len(scene.test) else scene.train
-    photographed = views.select(spread(len(views), MOST_PICTURES))
+    photographed = views.select(spread(len(views), MAX_PICTURES))
     splat = PageSplat(gaussians, _ground(photographed, scene.background), fit.options)
     return live_html(PageContent(splat, _photos(scene, ("training", "test"), roll), PageText(title)))
 
@@ -300,7 +300,7 @@ def _poses_note(metrics: Mapping[str, Any]) -> list[str]:
     if poses is None:
         return []
     mean = f"{poses['degrees']:.2f} degrees and {100 * poses['depths']:.2f} % of the median depth"
-    most = f"{poses['most_degrees']:.2f} degrees and {100 * poses['most_depths']:.2f} %"
+    most = f"{poses['max_degrees']:.2f} degrees and {100 * poses['max_depths']:.2f} %"
     return [f"The fit moved the training cameras by {mean} in the mean, and by at most {most}."]
 
 

@@ -3,7 +3,7 @@
 // something new. A page that nobody sees asks for nothing.
 
 const RETRY_MILLISECONDS = 2000;
-const MOST_RETRIES = 3;
+const MAX_RETRIES = 3;
 
 // What is newer than a version, as { version, text, isOver, splat }; null if nothing came for a while. `splat` is
 // absent where it has not changed. The answer is a line of JSON, and the float32 of each column in turn.
@@ -41,7 +41,7 @@ async function watchFit() {
   viewer.endTour();  // pictures without end would take the time of the fit
   const line = document.querySelector(".live");
   let version = 0, failures = 0;
-  while (failures <= MOST_RETRIES) {
+  while (failures <= MAX_RETRIES) {
     await untilSeen();
     try {
       const news = await newerThan(version);

@@ -15,7 +15,7 @@ from kgs.datasets.splits import select_evenly
 GAIN = 4  # factor by which differences are amplified
 _LONGER_SIDES = (1008, 756, 504, 378, 252)  # pixels; the first one with which all images fit is used
 _JPEG_QUALITY = 90
-MOST_THUMBNAILS = 24
+MAX_THUMBNAILS = 24
 _THUMBNAIL_SIZES = ((96, 80), (96, 65), (80, 60), (64, 50), (48, 40))  # height in pixels, and quality, likewise
 
 
@@ -36,12 +36,12 @@ class Picture:
     caption: str = ""
 
 
-def encoded(pictures: Sequence[Picture], most_bytes: int) -> list[dict[str, Any]]:
-    """Encode all pictures in the largest size in which their data URIs fit into `most_bytes`, or in the smallest one.
+def encoded(pictures: Sequence[Picture], max_bytes: int) -> list[dict[str, Any]]:
+    """Encode all pictures in the largest size in which their data URIs fit into `max_bytes`, or in the smallest one.
 
     Args:
         pictures: photos with their renders.
-        most_bytes: limit for all data URIs together. It can be exceeded in the smallest size.
+        max_bytes: limit for all data URIs together. It can be exceeded in the smallest size.
 
     Returns:
         For each picture its name, its caption, the data URI of its photo, and its renders as tuples of the run, the
@@ -50,23 +50,23 @@ def encoded(pictures: Sequence[Picture], most_bytes: int) -> list[dict[str, Any]
     rows = list[dict[str, Any]]()
     for side in _LONGER_SIDES:
         rows = [_encoded(picture, side) for picture in pictures]
-        if sum(map(_size, rows)) <= most_bytes:
+        if sum(map(_size, rows)) <= max_bytes:
             break
     return rows
 
 
 def in_strip(names: Sequence[str]) -> list[int]:
-    """Indices of the photos in the strip: up to `MOST_THUMBNAILS`, spread evenly, in the order of their names."""
+    """Indices of the photos in the strip: up to `MAX_THUMBNAILS`, spread evenly, in the order of their names."""
     order = sorted(range(len(names)), key=lambda i: names[i])
-    return [order[k] for k in select_evenly(len(order), min(len(order), MOST_THUMBNAILS))] if order else []
+    return [order[k] for k in select_evenly(len(order), min(len(order), MAX_THUMBNAILS))] if order else []
 
 
-def thumbnails(photos: Sequence[Tensor], most_bytes: int) -> list[dict[str, Any]]:
-    """Encode photos in the largest size in which their data URIs fit into `most_bytes`, or in the smallest one.
+def thumbnails(photos: Sequence[Tensor], max_bytes: int) -> list[dict[str, Any]]:
+    """Encode photos in the largest size in which their data URIs fit into `max_bytes`, or in the smallest one.
 
     Args:
         photos: RGB in [0, 1], each `(3, H, W)`.
-        most_bytes: limit for all data URIs together. It can be exceeded in the smallest size.
+        max_bytes: limit for all data URIs together. It can be exceeded in the smallest size.
 
     Returns:
         For each photo its data URI (photo), and its width and height in pixels.
@@ -74,7 +74,7 @@ def thumbnails(photos: Sequence[Tensor], most_bytes: int) -> list[dict[str, Any]
     rows = list[dict[str, Any]]()
     for height, quality in _THUMBNAIL_SIZES:
         rows = [_thumbnail(photo.detach().cpu().float(), height, quality) for photo in photos]
-        if sum(len(row["photo"]) for row in rows) <= most_bytes:
+        if sum(len(row["photo"]) for row in rows) <= max_bytes:
             break
     return rows
 

@@ -16,11 +16,11 @@ const FLIGHT_MILLISECONDS = 700;
 const STEEPEST = 1.5;  // largest angle above or below the horizon, in radians
 const ROAMING_ARC = Math.PI;  // radians that a drag across the stage turns where the cameras set no limit
 const SOFT_END = 0.25;  // how far beyond the arc of the cameras the eye can turn, as a share of the arc
-const LEAST_COVERAGE = 1 / 3;  // of the stage, by the splat: where the eye roams to
-const LEAST_PART = 1 / 2;  // likewise, of what it covers from the photo's camera, where that is less
+const MIN_COVERAGE = 1 / 3;  // of the stage, by the splat: where the eye roams to
+const MIN_PART = 1 / 2;  // likewise, of what it covers from the photo's camera, where that is less
 const ROAMING_STEP = 0.1;  // radians: how finely this is tested
 const NEAR_CAMERA = 0.02;  // of the distance: an eye farther than this from all cameras is beside them
-const LEAST_ZOOM = 0.3, MOST_ZOOM = 3;  // of the distance at the camera that the eye was last placed at
+const MIN_ZOOM = 0.3, MAX_ZOOM = 3;  // of the distance at the camera that the eye was last placed at
 const SLOW_SECONDS_PER_CAMERA = 4;  // of a tour that nobody asked for
 const TOUR_BEGIN_SECONDS = 2;  // in which the eye joins the path
 const TOUR_STILL_SECONDS = 1.5;  // of each picture, where the system asks for less motion
@@ -29,7 +29,7 @@ const TURN_PER_KEY = 0.06;
 const MOVE_PER_KEY = 20;  // pixels
 const ZOOM_PER_KEY = 0.9;
 const ZOOM_PER_WHEEL_PIXEL = 0.0015;  // natural logarithm of the distance
-const MOST_ZOOM_PER_WHEEL_EVENT = 0.3;
+const MAX_ZOOM_PER_WHEEL_EVENT = 0.3;
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 const ZOOM_KEYS = { "+": ZOOM_PER_KEY, "=": ZOOM_PER_KEY, "-": 1 / ZOOM_PER_KEY };
 
@@ -241,7 +241,7 @@ class Viewer {
     const coverage = (from) => this.renderer.coverage(this.withNearPlane(from), this.viewOf(from));
     this.usualCoverage ??= coverage(this.scene.cameras[this.chosen]);
     const farther = Math.max(1, eye.distance / this.usualDistance);
-    const least = Math.min(LEAST_COVERAGE, LEAST_PART * this.usualCoverage) / farther ** 2;
+    const least = Math.min(MIN_COVERAGE, MIN_PART * this.usualCoverage) / farther ** 2;
     const covered = coverage(eye);
     if (covered >= 2 * least) this.roamedTo = ahead;
     return covered >= least || covered >= coverage(before);
@@ -270,7 +270,7 @@ class Viewer {
   // Multiplies the distance to the target.
   zoom(factor) {
     const distance = clamped(
-      this.eye.distance * factor, LEAST_ZOOM * this.usualDistance, MOST_ZOOM * this.usualDistance,
+      this.eye.distance * factor, MIN_ZOOM * this.usualDistance, MAX_ZOOM * this.usualDistance,
     );
     this.change({ distance, position: add(target(this.eye), this.eye.rotation[2], -distance) });
   }
@@ -472,7 +472,7 @@ class Viewer {
       if (!this.isEngaged && !document.fullscreenElement) return;  // the page scrolls
       event.preventDefault();
       const logarithm = ZOOM_PER_WHEEL_PIXEL * event.deltaY;
-      this.zoom(Math.exp(clamped(logarithm, -MOST_ZOOM_PER_WHEEL_EVENT, MOST_ZOOM_PER_WHEEL_EVENT)));
+      this.zoom(Math.exp(clamped(logarithm, -MAX_ZOOM_PER_WHEEL_EVENT, MAX_ZOOM_PER_WHEEL_EVENT)));
     }, { passive: false });
   }
 

@@ -21,7 +21,7 @@ from .data import Packed, pack
 from .figures import facts, measure_table, psnr_of_views, verdict, without_folders
 from .pictures import GAIN, encoded, in_strip, thumbnails
 
-MOST_BYTES = 8_000_000  # of a page
+MAX_BYTES = 8_000_000  # of a page
 _PICTURE_BYTES = 3_000_000  # of all photos, renders and differences
 _THUMBNAIL_BYTES = 100_000  # of all thumbnails
 _LAYOUT_BYTES = 8192  # reserved for the layout of the splat and for sizes in the text
@@ -42,7 +42,7 @@ _FILES = [
 ]
 
 
-def write_page(path: Path, content: PageContent, most_bytes: int = MOST_BYTES) -> str:
+def write_page(path: Path, content: PageContent, max_bytes: int = MAX_BYTES) -> str:
     """Write a page with a viewer of a splat, photos beside renders, measures and facts. The write is atomic.
 
     The viewer opens at one of the training cameras nearest the mean pose, see `viewer_scene`. File names are shown as
@@ -52,7 +52,7 @@ def write_page(path: Path, content: PageContent, most_bytes: int = MOST_BYTES) -
     Args:
         path: the file to write.
         content: what the page shows.
-        most_bytes: limit for the page.
+        max_bytes: limit for the page.
 
     Returns:
         What the viewer shows less than the splat, in words, see :class:`kgs.app.page.data.Packed`; "" for nothing.
@@ -63,7 +63,7 @@ def write_page(path: Path, content: PageContent, most_bytes: int = MOST_BYTES) -
     """
     page = _Page(content)
     splat = content.splat
-    room = max(0, most_bytes - len(page.html()) - _LAYOUT_BYTES)
+    room = max(0, max_bytes - len(page.html()) - _LAYOUT_BYTES)
     packed = pack(
         splat.gaussians,
         content.photos.cameras,

@@ -21,7 +21,7 @@ from kgs.datasets.mask_files import find_mask_files
 from kgs.errors import DataError, listed
 
 FEWEST = 3
-MOST_FRAMES = 36  # of a video, where twelve would be too far apart
+MAX_FRAMES = 36  # of a video, where twelve would be too far apart
 _LISTED = 10
 CONVERT = (
     'kgs reads PNG, JPEG, WebP, TIFF and BMP, and HEIC with its extra (pip install -e ".[heic]"). Or make JPEGs: on a '

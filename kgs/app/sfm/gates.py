@@ -14,13 +14,13 @@ import torch
 from kgs.errors import DataError
 from kgs.geometry import degrees_between
 
-from .map import FEWEST_MATCHES, Cameras, PairGeometry
+from .map import MIN_MATCHES, Cameras, PairGeometry
 
 FOCAL_RANGE = 0.4, 3.0  # of the longer side
-FEWEST_POINTS = 50  # that each photo sees
-MOST_DEGREES = 2.0  # between the two solvers' rotations of a pair
-MOST_RATIO = 1.15  # of their focal lengths
-LEAST_RISE = 0.03  # relative growth of the squared errors if the focal length is a quarter off
+MIN_POINTS = 50  # that each photo sees
+MAX_DEGREES = 2.0  # between the two solvers' rotations of a pair
+MAX_RATIO = 1.15  # of their focal lengths
+MIN_RISE = 0.03  # relative growth of the squared errors if the focal length is a quarter off
 SAME_PLACE = 1.0  # pixels; photos whose matches move less in the median were taken from one place
 _PLANAR = 0.97  # share of matches that one homography explains; a scene with depth has a pair with a lower one
 _WITHOUT = "A fit without some photos: take them out of the folder"
@@ -49,8 +49,8 @@ def objections(cameras: Cameras | None, names: Sequence[str], longest: int) -> l
     ratios = sorted({focal / longest for focal in cameras.focals.values()})
     for ratio in (ratio for ratio in ratios if not FOCAL_RANGE[0] <= ratio <= FOCAL_RANGE[1]):
         reasons.append(f"the focal length came out at {ratio:.3g} times the longer side, where lenses have {limits}")
-    if few := [f"{name} ({count})" for name, count in cameras.points.items() if count < FEWEST_POINTS]:
-        reasons.append(f"fewer than {FEWEST_POINTS} points are seen in {', '.join(few)}")
+    if few := [f"{name} ({count})" for name, count in cameras.points.items() if count < MIN_POINTS]:
+        reasons.append(f"fewer than {MIN_POINTS} points are seen in {', '.join(few)}")
     return reasons
 
 
@@ -76,9 +76,9 @@ def angle_between(first: Cameras, second: Cameras, pair: tuple[str, str]) -> flo
 def focal_doubt(solutions: Sequence[Cameras]) -> str:
     """Why neither solution determines the focal length; "" if one does."""
     rise = max(0.0, *(cameras.focal_rise for cameras in solutions))
-    if rise >= LEAST_RISE:
+    if rise >= MIN_RISE:
         return ""
-    return f"where it is a quarter off, squared errors grow by {rise:.1%}, less than {LEAST_RISE:.0%}"
+    return f"where it is a quarter off, squared errors grow by {rise:.1%}, less than {MIN_RISE:.0%}"
 
 
 def focal_difference(solutions: Sequence[Cameras]) -> str:
@@ -87,9 +87,9 @@ def focal_difference(solutions: Sequence[Cameras]) -> str:
     focals = [[cameras.focal for cameras in solutions]]
     focals += [[cameras.focals[name] for cameras in solutions] for name in placed]
     ratio = max(max(of_lens) / min(of_lens) for of_lens in focals)
-    if ratio <= MOST_RATIO:
+    if ratio <= MAX_RATIO:
         return ""
-    return f"those of two solvers differ by a factor of {ratio:.3g}, more than {MOST_RATIO:g}"
+    return f"those of two solvers differ by a factor of {ratio:.3g}, more than {MAX_RATIO:g}"
 
 
 def judge(
@@ -127,14 +127,14 @@ def judge(
     if doubt := focal_doubt(both):
         raise DataError(folder, "", focal_refusal(doubt, names, pairs, forward))
     degrees, pair = disagreement(*both)
-    if degrees > MOST_DEGREES:
+    if degrees > MAX_DEGREES:
         reason = (
-            f"two solvers differ by {degrees:.3g} degrees about {' and '.join(pair)}; expected at most {MOST_DEGREES:g}"
+            f"two solvers differ by {degrees:.3g} degrees about {' and '.join(pair)}; expected at most {MAX_DEGREES:g}"
         )
         raise DataError(folder, "", refusal([reason], names, pairs, forward))
     if doubt := focal_difference(both):
         raise DataError(folder, "", focal_refusal(doubt, names, pairs, forward))
-    sure = {i: cameras for i, cameras in good.items() if cameras.focal_rise >= LEAST_RISE} or good
+    sure = {i: cameras for i, cameras in good.items() if cameras.focal_rise >= MIN_RISE} or good
     return max(sure, key=lambda i: min(sure[i].points.values())), degrees
 
 
@@ -142,7 +142,7 @@ def groups_of(names: Sequence[str], pairs: Pairs) -> list[list[str]]:
     """Groups of photos that overlapping pairs connect, the largest first, each in the order of `names`."""
     groups = [{name} for name in names]
     for pair, count in pairs.items():
-        if count >= FEWEST_MATCHES:
+        if count >= MIN_MATCHES:
             joined = [group for group in groups if group & set(pair)]
             groups = [group for group in groups if group not in joined] + [set().union(*joined)]
     return sorted((sorted(group, key=list(names).index) for group in groups), key=lambda g: (-len(g), g))

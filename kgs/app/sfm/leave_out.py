@@ -12,7 +12,7 @@ from itertools import combinations
 from kgs.errors import DataError
 
 from .find import FEWEST, listed_files
-from .gates import FEWEST_POINTS, MOST_DEGREES, MOST_RATIO, SAME_PLACE, Pairs, angle_between, gap, groups_of, matches_of
+from .gates import MIN_POINTS, MAX_DEGREES, MAX_RATIO, SAME_PLACE, Pairs, angle_between, gap, groups_of, matches_of
 from .map import Cameras, PairGeometry
 from .read import OpenPhoto, by_shape
 
@@ -128,8 +128,8 @@ def _placed_badly(first: Cameras, second: Cameras, names: Sequence[str], pairs: 
     placed = [name for name in names if name not in left]
     better = max((first, second), key=lambda cameras: _seen_well(cameras, placed))
     for name in placed:
-        if better.points[name] < FEWEST_POINTS:
-            few = f"only {better.points[name]} points are seen in it, fewer than {FEWEST_POINTS}"
+        if better.points[name] < MIN_POINTS:
+            few = f"only {better.points[name]} points are seen in it, fewer than {MIN_POINTS}"
             left[name] = f"{few}{_advice(name, names, pairs)}"
     return left | _other_lenses(first, second, [name for name in names if name not in left])
 
@@ -140,7 +140,7 @@ def _other_lenses(first: Cameras, second: Cameras, names: list[str]) -> dict[str
     return {
         name: f"two solvers differ by a factor of {max(ratio, 1 / ratio):.3g} about the focal length of its lens"
         for name, ratio in ratios.items()
-        if max(ratio, 1 / ratio) > MOST_RATIO
+        if max(ratio, 1 / ratio) > MAX_RATIO
     }
 
 
@@ -151,9 +151,9 @@ def _disputed(first: Cameras, second: Cameras, names: list[str]) -> dict[str, st
     """
     angles = {pair: angle_between(first, second, pair) for pair in combinations(names, 2)}
     left = dict[str, str]()
-    while angles and max(angles.values()) > MOST_DEGREES:
+    while angles and max(angles.values()) > MAX_DEGREES:
         of_name = {name: [angle for pair, angle in angles.items() if name in pair] for name in names}
-        worst = max(names, key=lambda name: (sum(angle > MOST_DEGREES for angle in of_name[name]), sum(of_name[name])))
+        worst = max(names, key=lambda name: (sum(angle > MAX_DEGREES for angle in of_name[name]), sum(of_name[name])))
         left[worst] = f"two solvers are {max(of_name[worst]):.3g} degrees apart about it"
         names = [name for name in names if name != worst]
         angles = {pair: angle for pair, angle in angles.items() if worst not in pair}
@@ -163,7 +163,7 @@ def _disputed(first: Cameras, second: Cameras, names: list[str]) -> dict[str, st
 def _seen_well(cameras: Cameras, names: Sequence[str]) -> tuple[int, int]:
     """How many photos see enough points, and how many the worst one sees."""
     counts = [cameras.points[name] for name in names]
-    return sum(count >= FEWEST_POINTS for count in counts), min(counts, default=0)
+    return sum(count >= MIN_POINTS for count in counts), min(counts, default=0)
 
 
 def _too_few_matches(name: str, group: Sequence[str], pairs: Pairs) -> str:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from .pycolmap_processes import check_space
 
-FEWEST_MATCHES = 30  # verified matches of a pair that overlaps; of noise up to 27 were verified
+MIN_MATCHES = 30  # verified matches of a pair that overlaps; of noise up to 27 were verified
 _MAX_ERROR = 1.5  # largest reprojection error, in pixels
 _FIRST_PAIR_DEGREES = 2.0  # least angle between the first two photos; COLMAP's 16 fails on photos that face one way
 _FIRST_PAIR_DEGREES_AGAIN = 0.2  # the same in a second attempt, if the first one places no pair
@@ -91,7 +91,7 @@ def pair_geometries(database: Path, names: Mapping[str, str]) -> dict[tuple[str,
         lens = file.read_all_cameras()[0]
         for i, j in combinations(sorted(images), 2):
             rows = _inliers(file, i, j)
-            if len(rows) >= FEWEST_MATCHES:
+            if len(rows) >= MIN_MATCHES:
                 first = places[i][rows[:, 0]]
                 second = places[j][rows[:, 1]]
                 _, planar = cv2.findHomography(first, second, cv2.RANSAC, _MAX_ERROR)

@@ -18,12 +18,12 @@ from kgs.progress import ProgressBar
 from .read import Photo
 
 SMALL = 1000  # pixels of the longer side; SIFT sees smaller photos at twice their size
-FEWEST_KEYPOINTS = 4096  # of one photo
-MOST_KEYPOINTS = 8192  # of one photo
-ALL_KEYPOINTS = 24_576  # of all photos together, if that leaves each one `FEWEST_KEYPOINTS`
+MIN_KEYPOINTS = 4096  # of one photo
+MAX_KEYPOINTS = 8192  # of one photo
+ALL_KEYPOINTS = 24_576  # of all photos together, if that leaves each one `MIN_KEYPOINTS`
 _CONTRAST = 0.01
 _CHUNK = 512  # keypoints compared at once: bounds the memory
-_FEWEST_MATCHES = 8  # matches of a pair that are worth verifying
+_MIN_MATCHES = 8  # matches of a pair that are worth verifying
 DEFAULT_FOCAL = 0.8  # of the longer side, if Exif does not say it; phones have 0.7 to 0.8
 
 
@@ -56,7 +56,7 @@ def write_matches(database: Path, photos: list[Photo], names: list[str], bar: Pr
         bar: wraps the loops to show their progress, see :mod:`kgs.progress`.
     """
     # The cost of matching grows with the squares of both counts, so many photos get fewer keypoints each.
-    most = min(MOST_KEYPOINTS, max(FEWEST_KEYPOINTS, ALL_KEYPOINTS // len(photos)))
+    most = min(MAX_KEYPOINTS, max(MIN_KEYPOINTS, ALL_KEYPOINTS // len(photos)))
     keypoints = [find_keypoints(photo, most) for photo in bar(photos, "keypoints", "photo")]
     area = photos[0].size[::-1]
     with _open(database) as file:
@@ -65,13 +65,13 @@ def write_matches(database: Path, photos: list[Photo], names: list[str], bar: Pr
             file.write_keypoints(image_id, of_photo.places.numpy())
         for i, j in bar(list(combinations(range(len(photos)), 2)), "matches", "pair"):
             pairs = _match(keypoints[i], keypoints[j], area)
-            if len(pairs) >= _FEWEST_MATCHES:
+            if len(pairs) >= _MIN_MATCHES:
                 file.write_matches(ids[i], ids[j], pairs.numpy().astype("uint32"))
 
 
 def _match(first: PhotoKeypoints, second: PhotoKeypoints, area: tuple[int, ...]) -> Tensor:
     """Indices of matching keypoints, `(M, 2)`: mutual nearest neighbours among descriptors that pass AdaLAM."""
-    if min(len(first.places), len(second.places)) < _FEWEST_MATCHES:
+    if min(len(first.places), len(second.places)) < _MIN_MATCHES:
         return torch.zeros(0, 2, dtype=torch.int64)
     nearest1 = []
     best2 = torch.full((len(second.places),), -1.0)
@@ -85,7 +85,7 @@ def _match(first: PhotoKeypoints, second: PhotoKeypoints, area: tuple[int, ...])
     columns = torch.cat(nearest1)
     rows = (nearest2[columns] == torch.arange(len(columns))).nonzero()[:, 0]
     columns = columns[rows]
-    if len(rows) < _FEWEST_MATCHES:
+    if len(rows) < _MIN_MATCHES:
         return torch.zeros(0, 2, dtype=torch.int64)
     _, pairs = match_adalam(
         first.descriptors[rows],

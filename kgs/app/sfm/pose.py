@@ -27,7 +27,7 @@ from kgs.progress import ProgressBar, silent
 
 from .agree import agreed_cameras, say_left_out
 from .find import find_photos, find_video
-from .gates import FEWEST_POINTS, FOCAL_RANGE, LEAST_RISE, MOST_DEGREES, MOST_RATIO
+from .gates import MIN_POINTS, FOCAL_RANGE, MIN_RISE, MAX_DEGREES, MAX_RATIO
 from .leave_out import unlike_others
 from .map import Cameras, quiet_pycolmap
 from .match import exif_focal
@@ -219,10 +219,10 @@ def find_cameras(
         "agreement_degrees": found.degrees,
         "gates": {
             "focal_over_longer_side": list(FOCAL_RANGE),
-            "least_points_of_a_photo": FEWEST_POINTS,
-            "most_degrees": MOST_DEGREES,
-            "most_focal_ratio": MOST_RATIO,
-            "least_focal_rise": LEAST_RISE,
+            "min_points_of_a_photo": MIN_POINTS,
+            "max_degrees": MAX_DEGREES,
+            "max_focal_ratio": MAX_RATIO,
+            "min_focal_rise": MIN_RISE,
             "passed": True,
         },
         "seconds": seconds,

@@ -12,11 +12,11 @@ judged by how well it agrees with the other solver: of many tries one would agre
 from collections.abc import Iterable, Mapping, Sequence, Set
 from pathlib import Path
 
-from .gates import FEWEST_POINTS
+from .gates import MIN_POINTS
 from .map import Cameras, solve, verified
 
-_FEWEST_TRIES = 2  # with other first pairs
-_MOST_TRIES = 4
+_MIN_TRIES = 2  # with other first pairs
+_MAX_TRIES = 4
 _PLACINGS = 48  # of photos in all tries together, if that leaves as many tries: each places all photos
 
 
@@ -49,7 +49,7 @@ def look_again(
     photos = list(names.values())
     best = found
     were_placed = len(seen_well(found, photos)) == len(photos)
-    tries = min(_MOST_TRIES, max(_FEWEST_TRIES, _PLACINGS // len(photos)))
+    tries = min(_MAX_TRIES, max(_MIN_TRIES, _PLACINGS // len(photos)))
     for number, pair in enumerate(_first_pairs(database, names, doubtful)[:tries], 1):
         fewest = min(len(seen_well(best, photos)) + 1, len(photos))
         cameras = solve(database, images, work, seed + number, names, focals, first_pair=pair, fewest=fewest)
@@ -74,7 +74,7 @@ def _first_pairs(database: Path, names: Mapping[str, str], doubtful: Set[str]) -
 def seen_well(cameras: Cameras | None, names: Iterable[str]) -> set[str]:
     """Which of these photos a solver placed so that they see enough points."""
     points = cameras.points if cameras else {}
-    return {name for name in names if points.get(name, 0) >= FEWEST_POINTS}
+    return {name for name in names if points.get(name, 0) >= MIN_POINTS}
 
 
 def _better(one: Cameras | None, other: Cameras | None, photos: Sequence[str]) -> Cameras | None:

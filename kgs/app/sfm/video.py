@@ -26,13 +26,13 @@ from kgs.app.files.outputs import write_png
 from kgs.errors import DataError
 from kgs.progress import ProgressBar
 
-from .find import FEWEST, MOST_FRAMES
+from .find import FEWEST, MAX_FRAMES
 from .match import DEFAULT_FOCAL
 from .read import sharpness
 
 FRAMES = 12
-LEAST_DEGREES = 3.0  # between neighbours
-MOST_DEGREES = 10.0
+MIN_DEGREES = 3.0  # between neighbours
+MAX_DEGREES = 10.0
 _LOOKED_AT = 500  # frames, spread over the video
 _LONGEST = 480  # pixels of a frame that is looked at
 _STEP = 0.75  # degrees; after so large a move new points are tracked
@@ -75,8 +75,8 @@ def take_frames(
         expected = f"expected a video in which the camera moves by {least:g} degrees or more"
         raise DataError(video, "", f"{expected}, got {way:.1f} degrees in {len(frames)} frames")
     if count is None:
-        count = max(FEWEST, min(FRAMES, round(way / LEAST_DEGREES) + 1))
-        count = max(count, min(MOST_FRAMES, math.ceil(way / MOST_DEGREES) + 1))
+        count = max(FEWEST, min(FRAMES, round(way / MIN_DEGREES) + 1))
+        count = max(count, min(MAX_FRAMES, math.ceil(way / MAX_DEGREES) + 1))
     indices = _sharpest(frames, count)
     paths = []
     with _Reader(video) as reader:

@@ -39,7 +39,7 @@ class DeviceSettings:
 
 
 SETTINGS = {"cpu": DeviceSettings(2**19, 192, True, True), "cuda": DeviceSettings(2**24, 192, False, False)}
-_LEAST_LAYERS = 8  # of a step with many tiles
+_MIN_LAYERS = 8  # of a step with many tiles
 _ARRAYS = 9  # numbers per pair that a step holds at the same time
 
 
@@ -228,10 +228,10 @@ class Cut:
 
     def __call__(self, lengths: Sequence[int], pixels: int) -> list[Step]:
         """The steps of tiles with lists of these lengths, in descending order."""
-        most_tiles = max(1, self.pairs // (pixels * (self.layers or _LEAST_LAYERS)))
+        max_tiles = max(1, self.pairs // (pixels * (self.layers or _MIN_LAYERS)))
         steps = []
-        for begin in range(0, len(lengths), most_tiles):
-            end = min(begin + most_tiles, len(lengths))
+        for begin in range(0, len(lengths), max_tiles):
+            end = min(begin + max_tiles, len(lengths))
             first = 0
             while first < lengths[begin]:
                 while lengths[end - 1] <= first:
