@@ -52,17 +52,17 @@ def find_border_mask(images: Tensor) -> Tensor | None:
 def _top_border(bright: Tensor) -> Tensor:
     """The border mask `(K, W)` of the first rows of photos `(V, H, W)`; K is 0 without a border there."""
     height, width = bright.shape[1:]
-    most = max(MIN_LINES, round(WIDEST * height))
-    if height <= 2 * most:
+    maximum = max(MIN_LINES, round(WIDEST * height))
+    if height <= 2 * maximum:
         return bright.new_zeros(0, width)
     rows = bright.mean(dim=2)
     outer = rows[:, 0]
-    inside = rows[:, most]
-    farther = rows[:, 2 * most - 1]
+    inside = rows[:, maximum]
+    farther = rows[:, 2 * maximum - 1]
     if bool(((inside < FAINTEST) | (outer > DARK * inside) | (inside < DARK * farther)).any()):  # in any photo
         return bright.new_zeros(0, width)
     half = int(ALONG * width) // 2
-    sums = avg_pool1d(bright[:, : 2 * most].sum(dim=0), 2 * half + 1, 1, half, count_include_pad=False)
-    shares = (sums[:most] / sums[most:].mean(dim=0).clamp(min=1e-6)).clamp(max=1.0)
+    sums = avg_pool1d(bright[:, : 2 * maximum].sum(dim=0), 2 * half + 1, 1, half, count_include_pad=False)
+    shares = (sums[:maximum] / sums[maximum:].mean(dim=0).clamp(min=1e-6)).clamp(max=1.0)
     end = int((shares.mean(dim=1) < CLEAR).cumprod(dim=0).sum())
     return torch.where(shares[:end] < CLEAR, shares[:end], 1.0)

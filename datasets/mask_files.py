@@ -38,10 +38,10 @@ class MaskFiles(NamedTuple):
     moving: dict[Path, Path]  # instant-ngp's: black is kept
     unused: list[Path]  # files that fit no photo or are of one that has a mask, and folders that are named like masks
 
-    def notes(self, root: Path, most: int) -> list[str]:
-        """A sentence that names up to `most` of what is not used, relative to the scene's folder; [] for nothing."""
+    def notes(self, root: Path, max_names: int) -> list[str]:
+        """A sentence that names up to `max_names` of what is not used, relative to the scene's folder; [] for nothing."""
         names = [path.relative_to(root) if path.is_relative_to(root) else path for path in self.unused]
-        return [f"named like masks and not used: {listed(names, most)}: {MASKS_ARE_IN}"] if names else []
+        return [f"named like masks and not used: {listed(names, max_names)}: {MASKS_ARE_IN}"] if names else []
 
 
 def find_mask_files(photos: Sequence[Path], root: Path, folder: Path | None = None) -> MaskFiles:

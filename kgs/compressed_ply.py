@@ -137,8 +137,8 @@ def _in_chunks(means: NDArray[np.float64]) -> NDArray[np.intp]:
             continue
         axis = np.ptp(steps[rows], axis=0).argmax()
         rows = rows[np.argsort(steps[rows, axis], kind="stable")]
-        least = max(1, chunks // 8)
-        cuts = np.arange(least, chunks - least + 1) * _CHUNK
+        minimum = max(1, chunks // 8)
+        cuts = np.arange(minimum, chunks - minimum + 1) * _CHUNK
         before = _sizes_of_boxes(steps[rows])[cuts - 1]
         behind = _sizes_of_boxes(steps[rows[::-1]])[len(rows) - cuts - 1]
         cut = cuts[(before * cuts + behind * (len(rows) - cuts)).argmin()]

@@ -98,13 +98,13 @@ class Densifier:
         generator: torch.Generator | None = None,
     ) -> None:
         check_kind("model", model, GaussianModel)
-        most = 1 if max_gaussians is None else max_gaussians
+        maximum = 1 if max_gaussians is None else max_gaussians
         for name, number, fits, expected in (
             ("extent", extent, 0.0 < extent < math.inf, "a finite number > 0"),
             ("percent_dense", percent_dense, 0.0 < percent_dense < math.inf, "a finite number > 0"),
             ("grad_threshold", grad_threshold, grad_threshold >= 0.0, "a number >= 0"),
             ("prune_opacity", prune_opacity, 0.0 <= prune_opacity <= 1.0, "a number in [0, 1]"),
-            ("max_gaussians", max_gaussians, most >= 1 and most % 1 == 0, "an integer >= 1 or None"),
+            ("max_gaussians", max_gaussians, maximum >= 1 and maximum % 1 == 0, "an integer >= 1 or None"),
         ):
             if not fits:
                 raise ValueError(f"{name}: expected {expected}, got {number}")

@@ -11,10 +11,10 @@ def printable(text: object) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
 
 
-def listed(names: Sequence[object], most: int = 3) -> str:
+def listed(names: Sequence[object], max_names: int = 3) -> str:
     """The first names of several, printable, and how many more there are."""
-    more = len(names) - most
-    text = ", ".join(printable(name) for name in names[:most])
+    more = len(names) - max_names
+    text = ", ".join(printable(name) for name in names[:max_names])
     return f"{text} and {more} more" if more > 0 else text
 
 

@@ -27,9 +27,9 @@ def read_json(path: Path, finite: bool = True) -> dict[str, Any]:
     return value
 
 
-def is_number(value: Any, least: float = -1e300, whole: bool = False) -> TypeGuard[float]:
-    """Whether a JSON value is a number from `least` to a fixed limit, and no bool; JSON itself has no limit."""
-    return type(value) in ((int,) if whole else (int, float)) and least <= value < (2**48 if whole else 1e300)
+def is_number(value: Any, minimum: float = -1e300, whole: bool = False) -> TypeGuard[float]:
+    """Whether a JSON value is a number from `minimum` to a fixed limit, and no bool; JSON itself has no limit."""
+    return type(value) in ((int,) if whole else (int, float)) and minimum <= value < (2**48 if whole else 1e300)
 
 
 def write_json(path: Path, value: Any) -> None:

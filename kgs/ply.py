@@ -216,11 +216,11 @@ def _why_left_out(table: NDArray[np.float32], kept: NDArray[np.bool_]) -> str:
 
 def _degree_of_file(sh_degree: int | None, model: GaussianModel) -> int:
     """The degree of the harmonics that `save_ply` writes; a ValueError if they cannot hold the model's."""
-    least = model.max_sh_degree
+    minimum = model.max_sh_degree
     if sh_degree is None:
-        return least
-    if not isinstance(sh_degree, int | np.integer) or not least <= sh_degree <= MAX_SH_DEGREE:
-        expected = f"an integer from {least}, the model's, to {MAX_SH_DEGREE}"
+        return minimum
+    if not isinstance(sh_degree, int | np.integer) or not minimum <= sh_degree <= MAX_SH_DEGREE:
+        expected = f"an integer from {minimum}, the model's, to {MAX_SH_DEGREE}"
         raise ValueError(f"sh_degree: expected {expected}, got {sh_degree!r}")
     return int(sh_degree)
 

@@ -52,8 +52,8 @@ def visibility_cutoff(opacities: Tensor, alpha_threshold: float) -> Tensor:
 
     At least 3, and enough for an opacity of 2 or the largest of all, if that is more.
     """
-    least = torch.full((1,), 2.0, dtype=opacities.dtype, device=opacities.device)
-    largest = torch.cat([opacities.flatten(), least]).amax()
+    minimum = torch.full((1,), 2.0, dtype=opacities.dtype, device=opacities.device)
+    largest = torch.cat([opacities.flatten(), minimum]).amax()
     return cut_squared(largest, alpha_threshold).clamp_min(9.0).sqrt()
 
 

@@ -63,14 +63,14 @@ def synthetic_scene(
     Raises:
         ValueError: the kind is unknown, or a number is out of range.
     """
-    for name, value, least in (
+    for name, value, minimum in (
         ("train_views", train_views, 1),
         ("test_views", test_views, 0),
         ("size", min(size), 1),
         ("seed", seed, 0),
     ):
-        if value < least:
-            raise ValueError(f"{name}: expected at least {least}, got {value}")
+        if value < minimum:
+            raise ValueError(f"{name}: expected at least {minimum}, got {value}")
     setup = _setup(kind, seed)
     train_eyes, test_eyes = setup.place(train_views, test_views, np.random.default_rng([seed, 1]))
     with torch.device("cpu"):  # whatever torch's default is

@@ -74,10 +74,10 @@ def received(lights: Lights, points: Array, normals: Array) -> NDArray[np.float3
     return light
 
 
-def _cap(axis: Array, count: int, least: float) -> Array:
+def _cap(axis: Array, count: int, minimum: float) -> Array:
     """Directions `(count, 3)` spread evenly over the cap whose angle to the axis has at least that cosine."""
     k = np.arange(count) + 0.5
-    cosine = 1 - (1 - least) * k / count
+    cosine = 1 - (1 - minimum) * k / count
     turn = k * np.pi * (3 - np.sqrt(5))
     sine = np.sqrt(1 - cosine**2)
     return np.stack([sine * np.cos(turn), sine * np.sin(turn), cosine], axis=-1) @ _frame(axis).T

@@ -30,7 +30,7 @@ with suppress(ImportError):  # the extra heic
 KGS = (sys.executable, "-P", "-c", "from kgs.app.cli import main; main()", "fit")  # -P: no module from a job's folder
 KINDS = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "WEBP": ".webp", "HEIF": ".heic"}  # by Pillow's names
 RESULTS = ("index.html", "splat.ply", "turntable.mp4", "turntable.webm")
-FEWEST, MOST = 3, 12  # photos
+MIN_PHOTOS, MAX_PHOTOS = 3, 12  # photos
 MEGABYTES, ALL_MEGABYTES = 30, 200  # of a photo, of all
 MEGAPIXELS = 64  # of a photo
 MINUTES = 20  # of a job
@@ -50,8 +50,8 @@ def named(photos: Sequence[Path]) -> dict[str, Path]:
     Raises:
         Refused: too few, too many, too large, or no photos.
     """
-    if not FEWEST <= len(photos) <= MOST:
-        raise Refused(f"Expected {FEWEST} to {MOST} photos, got {len(photos)}.")
+    if not MIN_PHOTOS <= len(photos) <= MAX_PHOTOS:
+        raise Refused(f"Expected {MIN_PHOTOS} to {MAX_PHOTOS} photos, got {len(photos)}.")
     if not all(photo.is_file() for photo in photos):
         raise Refused("A photo is no longer here. Please upload the photos again.")
     if sum(photo.stat().st_size for photo in photos) > ALL_MEGABYTES * 2**20:
@@ -128,7 +128,7 @@ def kill(process: subprocess.Popen[bytes]) -> None:
 ABOUT = f"""
 # Photos in, page out
 
-Upload {FEWEST} to {MOST} photos of something that does not move, with a step to the side between them, as your camera
+Upload {MIN_PHOTOS} to {MAX_PHOTOS} photos of something that does not move, with a step to the side between them, as your camera
 wrote them. You get a page in which you can look around: Gaussian splatting by kgs.
 
 Keep this page open: what nobody waits for is stopped. A job takes some minutes, {MINUTES} at most. Photos and results

@@ -145,10 +145,10 @@ def _random(count: int, size: int, angle: float = 60.0, **changes: tuple[float, 
     rng = np.random.default_rng([7, count])
     half = math.tan(math.radians(angle) / 2)
     shortest, longest = bounds["spread"]
-    least, most = bounds["ratios"]
+    minimum, maximum = bounds["ratios"]
     z = rng.uniform(*bounds["depths"], (n, 1))
     scales = shortest * (longest / shortest) ** rng.random((n, 1)) * z * 2 * half / size
-    scales = np.concatenate([scales, scales / (least * (most / least) ** rng.random((n, 2)))], 1)
+    scales = np.concatenate([scales, scales / (minimum * (maximum / minimum) ** rng.random((n, 2)))], 1)
     means = np.concatenate([rng.uniform(-1.1, 1.1, (n, 2)) * half * z, z], 1)
     opacities = rng.uniform(*bounds["opacities"], n)
     parts = (means, rng.normal(size=(n, 4)), scales, opacities, rng.uniform(0, 1, (n, 3)))

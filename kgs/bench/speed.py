@@ -209,10 +209,10 @@ def _memory(count: int, backend: str) -> float:
     return peak_rss_mb() - before
 
 
-def _scaling(rows: list[Row], fewest: int) -> dict[str, np.ndarray]:
+def _scaling(rows: list[Row], minimum: int) -> dict[str, np.ndarray]:
     """Pairs of a size and seconds, `(P, 2)`: by Gaussians and pairs at the full size, by pixels at a fixed count."""
     full = [row for row in rows if (row["height"], row["width"]) == SIZE]
-    fixed = [row for row in rows if row["gaussians"] == fewest]
+    fixed = [row for row in rows if row["gaussians"] == minimum]
     points = {
         "Gaussians": [(row["gaussians"], row["wall_s"]) for row in full],
         "pairs": [(1e6 * row["pairs_millions"], row["wall_s"]) for row in full],

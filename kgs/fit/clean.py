@@ -175,10 +175,10 @@ def clean(fit: Fit, strength: float = 1.0, bar: ProgressBar = silent) -> Cleaned
     order = candidates[_changes(fit, strays.any, bar).argsort()]
     cleaned = fit
     after = before
-    fewest = 0
-    most = len(order)
-    count = most  # all of them, and then by halves
-    while most - fewest >= max(1, len(order) // _PARTS):
+    low = 0
+    high = len(order)
+    count = high  # all of them, and then by halves
+    while high - low >= max(1, len(order) // _PARTS):
         rows = torch.ones_like(strays.any)
         rows[order[:count]] = False
         part = replace(fit, model=fit.model.select(rows))
@@ -186,14 +186,14 @@ def clean(fit: Fit, strength: float = 1.0, bar: ProgressBar = silent) -> Cleaned
         if all(old - new <= TOLERANCE * strength for old, new in zip(before, levels, strict=True)):
             cleaned = part
             after = levels
-            fewest = count
+            low = count
         else:
-            most = count - 1
-        count = (fewest + most + 1) // 2
+            high = count - 1
+        count = (low + high + 1) // 2
     check_left(len(cleaned.model))
     removed = torch.zeros_like(strays.any)
-    removed[order[:fewest]] = True
-    return Cleaned(cleaned, strays.counts(removed), len(order) - fewest, tuple(before), tuple(after))
+    removed[order[:low]] = True
+    return Cleaned(cleaned, strays.counts(removed), len(order) - low, tuple(before), tuple(after))
 
 
 def check_strength(strength: float) -> None:

@@ -15,18 +15,18 @@ from typing import Annotated, Any, Literal, NamedTuple, Self, get_args, get_orig
 class _Range(NamedTuple):
     """The interval of valid numbers. Of its `ends`, "[" and "]" include a limit, "(" and ")" exclude it."""
 
-    least: float
-    most: float = 1e300
+    low: float
+    high: float = 1e300
     ends: str = "[]"
 
     def holds(self, value: float) -> bool:
-        is_excluded = (value == self.least and self.ends[0] != "[") or (value == self.most and self.ends[1] != "]")
-        return self.least <= value <= self.most and not is_excluded
+        is_excluded = (value == self.low and self.ends[0] != "[") or (value == self.high and self.ends[1] != "]")
+        return self.low <= value <= self.high and not is_excluded
 
     def __str__(self) -> str:
-        if self.most == 1e300:
-            return f"{'of at least' if self.ends[0] == '[' else 'above'} {self.least:g}"
-        return f"in {self.ends[0]}{self.least:.12g}, {self.most:.12g}{self.ends[1]}"
+        if self.high == 1e300:
+            return f"{'of at least' if self.ends[0] == '[' else 'above'} {self.low:g}"
+        return f"in {self.ends[0]}{self.low:.12g}, {self.high:.12g}{self.ends[1]}"
 
 
 _Steps = Annotated[int, _Range(1, 10_000_000)]
@@ -105,8 +105,8 @@ class Recipe:
     def __post_init__(self) -> None:
         _check(self)
         if self.reset_interval and self.reset_opacity <= self.prune_opacity:
-            least = f"above prune_opacity ({self.prune_opacity:g}), or a reset would remove all Gaussians"
-            raise ValueError(f"reset_opacity: expected a number {least}, got {self.reset_opacity:g}")
+            expected = f"above prune_opacity ({self.prune_opacity:g}), or a reset would remove all Gaussians"
+            raise ValueError(f"reset_opacity: expected a number {expected}, got {self.reset_opacity:g}")
 
 
 @dataclass(frozen=True)

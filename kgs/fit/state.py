@@ -286,7 +286,7 @@ def check_plain(values: dict[str, Any], *names: str) -> None:
             raise ValueError(f"{name}: expected {expected}, got {str(values[name])[:80]!r}")
 
 
-_is_count = partial(is_number, least=0, whole=True)
+_is_count = partial(is_number, minimum=0, whole=True)
 
 
 def _is_list(value: Any, is_right: Callable[[Any], bool]) -> bool:

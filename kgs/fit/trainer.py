@@ -363,10 +363,10 @@ class Trainer:
         state = self.state
         self._stop_if(scale_fault(state.model, state.start.extent))
         first = state.start.init["points"]
-        most = state.densifier.max_gaussians
+        maximum = state.densifier.max_gaussians
         capped = state.densifier.step().capped
-        if capped and most < 1.25 * first:
-            state.note(f"max_gaussians: {most} leaves little room beside the {first} initial points")
+        if capped and maximum < 1.25 * first:
+            state.note(f"max_gaussians: {maximum} leaves little room beside the {first} initial points")
 
     def _stop_if(self, fault: str) -> None:
         if fault:

@@ -99,8 +99,8 @@ def _without_outliers(colors: Tensor, visible: Tensor) -> Tensor:
     """Colours at most `MAX_APART` typical differences from their patch's median: hidden surfaces have any colour."""
     medians = colors.masked_fill(~visible[..., None], math.nan).nanmedian(1, keepdim=True).values
     differences = colors - medians
-    most = MAX_APART * float(differences[visible].abs().median())
-    return medians + differences.clamp(-most, most)
+    maximum = MAX_APART * float(differences[visible].abs().median())
+    return medians + differences.clamp(-maximum, maximum)
 
 
 def harmonics_kernel(directions: Tensor) -> Tensor:

@@ -157,13 +157,13 @@ def _harmonics(colors: Any, sh_degree: int | None, batch: tuple[int, ...], n: in
     if not isinstance(sh_degree, int | np.integer) or sh_degree not in range(len(SH_SIZES)):
         raise ValueError(f"sh_degree: expected 0 to {len(SH_SIZES) - 1} or None, got {sh_degree!r}")
     check_tensor("colors", colors, like, " as means")
-    least = SH_SIZES[sh_degree]
+    minimum = SH_SIZES[sh_degree]
     shape = tuple(colors.shape)
-    if shape[:-2] not in ((n,), (*batch, n)) or shape[-2] < least or shape[-1] != 3:
+    if shape[:-2] not in ((n,), (*batch, n)) or shape[-2] < minimum or shape[-1] != 3:
         shapes = " or ".join(dict.fromkeys(str((*part, n, "K", 3)) for part in ((), batch)))
-        expected = f"{shapes} with K >= {least} for sh_degree {sh_degree}"
+        expected = f"{shapes} with K >= {minimum} for sh_degree {sh_degree}"
         raise ValueError(f"colors: expected shape {expected}, got {shape}")
-    used: Tensor = colors[..., :least, :].reshape(math.prod(shape[:-3]), n, least, 3)
+    used: Tensor = colors[..., :minimum, :].reshape(math.prod(shape[:-3]), n, minimum, 3)
     return used
 
 

@@ -14,7 +14,7 @@ from kgs.progress import ProgressBar, silent
 from kgs.types import check_kind
 
 from .agreement import interpolate
-from .dense import FEWEST, dense_points
+from .dense import MIN_POINTS, dense_points
 from .depth_limits import MIN_SIFT, certain_points, depth_range, sweep_range
 from .files import read_points
 from .patches import PatchColors
@@ -113,7 +113,7 @@ def initial_points(
             f"initial points: {len(views)} training views agree on {dense.agreed} points only; SIFT points instead"
         )
         warn(message)
-    count = FEWEST if count is None else count
+    count = MIN_POINTS if count is None else count
     if kind in ("dense", "sift"):
         if len(tracked) >= MIN_SIFT:
             colors = _mean_colors(views.images, tracked.tracks.pixels, tracked.tracks.visible)

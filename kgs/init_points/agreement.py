@@ -85,8 +85,8 @@ def _strays(depths: Tensor, mask: Tensor) -> Tensor:
     if not mask.any():
         return mask
     inverse = torch.where(mask, 1 / depths, 0.0)
-    least = inverse[mask].min()
-    shares = ((inverse - least) / (inverse.max() - least).clamp_min(1e-30)).numpy()
+    minimum = inverse[mask].min()
+    shares = ((inverse - minimum) / (inverse.max() - minimum).clamp_min(1e-30)).numpy()
     levels = np.where(mask, np.rint(LEVELS * shares), NO_LEVEL).astype(np.int16)
     cv2.filterSpeckles(levels, NO_LEVEL, int(MIN_PIECE * mask.numel()), JUMP * LEVELS)
     is_large = levels != NO_LEVEL

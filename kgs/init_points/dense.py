@@ -32,10 +32,10 @@ MAX_SHIFT = 512
 SMALLEST = 64  # pixels, the least side of an image that was halved for this
 # The number of points for a count of None: one for so many pixels with an agreed depth, between two limits.
 PIXELS_OF_A_POINT = 3
-FEWEST = 30_000
-MOST = 60_000
+MIN_POINTS = 30_000
+MAX_POINTS = 60_000
 FEW_VIEWS = 3
-MAX_OF_FEW_VIEWS = 90_000  # of up to so few views; with more, such fits take 1.4 times as long
+MAX_POINTS_FEW_VIEWS = 90_000  # of up to so few views; with more, such fits take 1.4 times as long
 
 
 class DensePoints(NamedTuple):
@@ -63,8 +63,8 @@ def dense_points(
 
     The scene lies between the depths `near` and `far`; the sky behind it gets points, too.
 
-    A `count` of None is one point for every `PIXELS_OF_A_POINT` pixels with an agreed depth, between `FEWEST` and
-    `MOST` (`MAX_OF_FEW_VIEWS`), in images that have together `pixels` pixels, or those of the views.
+    A `count` of None is one point for every `PIXELS_OF_A_POINT` pixels with an agreed depth, between `MIN_POINTS` and
+    `MAX_POINTS` (`MAX_POINTS_FEW_VIEWS`), in images that have together `pixels` pixels, or those of the views.
 
     `draw` is "uniform", or "spread" evenly over the images: one point from each of about as many cells. Points lie
     where the pixels of both views are usable.
@@ -77,8 +77,8 @@ def dense_points(
     points, colors, places = map(torch.cat, zip(*parts, strict=True))
     if count is None:
         agreed = round(pixels * len(points) / views.images[:, 0].numel())
-        most = MAX_OF_FEW_VIEWS if len(views) <= FEW_VIEWS else MOST
-        count = min(max(agreed // PIXELS_OF_A_POINT, FEWEST), most)
+        maximum = MAX_POINTS_FEW_VIEWS if len(views) <= FEW_VIEWS else MAX_POINTS
+        count = min(max(agreed // PIXELS_OF_A_POINT, MIN_POINTS), maximum)
     view, x, y = places.unbind(1)
     is_sky = torch.stack([depth_map.depths for depth_map in maps])[view, y, x] > SKY * far
     chosen = torch.randperm(len(points), generator=generator)
@@ -115,8 +115,8 @@ def agreed_depths(
 
 def _with_less_sky(is_sky: Tensor) -> Tensor:
     """The rows of all points of the scene, and of the first points of the sky: one for each `PER_SKY` of the scene."""
-    most = int((~is_sky).sum()) // PER_SKY
-    rows: Tensor = (~is_sky | (is_sky.cumsum(0) <= most)).nonzero()[:, 0]
+    maximum = int((~is_sky).sum()) // PER_SKY
+    rows: Tensor = (~is_sky | (is_sky.cumsum(0) <= maximum)).nonzero()[:, 0]
     return rows
 
 
@@ -125,14 +125,14 @@ def _one_per_cell(places: NDArray[np.int64], count: int) -> Tensor:
     first = np.arange(len(places))
     views, width, height = places.max(0, initial=0).tolist()
     view, x, y = places.T
-    least, most = 1.0, max(width, height) + 1.0  # limits of a cell's side in pixels, for bisection
-    while len(first) > count or (len(places) > count and most - least > 1e-3):
-        side = 0.5 * (least + most)
+    minimum, maximum = 1.0, max(width, height) + 1.0  # limits of a cell's side in pixels, for bisection
+    while len(first) > count or (len(places) > count and maximum - minimum > 1e-3):
+        side = 0.5 * (minimum + maximum)
         shape = (views + 1, int(width / side) + 1, int(height / side) + 1)
         cells = np.ravel_multi_index((view, (x / side).astype(np.int64), (y / side).astype(np.int64)), shape)
         first = _first_of_each(cells, math.prod(shape))
-        least, most = (side, most) if len(first) > count else (least, side)
-        if most - least < 1e-9:
+        minimum, maximum = (side, maximum) if len(first) > count else (minimum, side)
+        if maximum - minimum < 1e-9:
             break  # more views than points
     return torch.from_numpy(np.sort(first))[:count]
 

@@ -27,8 +27,8 @@ def certain_points(
 def depth_range(tracked: TrackedPoints, geometry: ViewGeometry) -> tuple[float, float]:
     """The expected range of depths: from those of the points if they are at least two, else from the cameras."""
     if len(tracked) > 1:
-        least, most = np.quantile(tracked.depths[tracked.depths > 0], (0.01, 0.99)).tolist()
-        return 0.8 * least, 1.25 * most
+        minimum, maximum = np.quantile(tracked.depths[tracked.depths > 0], (0.01, 0.99)).tolist()
+        return 0.8 * minimum, 1.25 * maximum
     meeting = meeting_point(geometry.extrinsics)
     if meeting is not None:
         axes = geometry.extrinsics[:, 2, :3]
@@ -52,8 +52,8 @@ def _within_typical_depths(tracked: TrackedPoints) -> Tensor:
     visible = tracked.tracks.visible
     if not visible.any():
         return torch.zeros(len(tracked), dtype=torch.bool)
-    least, most = np.quantile(depths[visible], (0.01, 0.99)).tolist()  # torch.quantile takes up to 16 million values
-    typical: Tensor = ((depths > 0.5 * least) & (depths < 2.0 * most)) | ~visible
+    minimum, maximum = np.quantile(depths[visible], (0.01, 0.99)).tolist()  # torch.quantile takes up to 16 million values
+    typical: Tensor = ((depths > 0.5 * minimum) & (depths < 2.0 * maximum)) | ~visible
     return typical.all(1)
 
 

@@ -52,10 +52,10 @@ def read_points(path: Path, origin: Tensor | None = None) -> tuple[Tensor, Tenso
     return points, colors
 
 
-def _check_size(path: Path, most: int, why: str = "") -> None:
-    """Raise a DataError for a file of more than `most` bytes."""
-    if path.stat().st_size > most:
-        raise DataError(path, "", f"is larger than {most // 2**20} MiB{why}")
+def _check_size(path: Path, max_bytes: int, why: str = "") -> None:
+    """Raise a DataError for a file of more than `max_bytes` bytes."""
+    if path.stat().st_size > max_bytes:
+        raise DataError(path, "", f"is larger than {max_bytes // 2**20} MiB{why}")
 
 
 def _read_splat(path: Path, origin: Tensor | None) -> tuple[Tensor, Tensor]:

@@ -23,13 +23,13 @@ class Keypoints(NamedTuple):
 
 
 def root_sift(
-    grey: NDArray[Any], most: int, factor: int = 1, mask: NDArray[np.uint8] | None = None, **thresholds: Any
+    grey: NDArray[Any], max_count: int, factor: int = 1, mask: NDArray[np.uint8] | None = None, **thresholds: Any
 ) -> Keypoints:
-    """The strongest SIFT keypoints of an image, up to `most`; nothing is random.
+    """The strongest SIFT keypoints of an image, up to `max_count`; nothing is random.
 
     Args:
         grey: `(H, W)`, 8 bits.
-        most: the largest number of keypoints.
+        max_count: the largest number of keypoints.
         factor: the image is enlarged by this whole number first.
         mask: `(H, W)`, keypoints lie where it is not 0; None: everywhere.
         thresholds: of the detector, as keyword arguments of `cv2.SIFT_create`.
@@ -39,7 +39,7 @@ def root_sift(
         if mask is not None:
             mask = mask.repeat(factor, 0).repeat(factor, 1)
     # enable_precise_upscale: without it OpenCV's keypoints are a quarter of a pixel off.
-    sift = cv2.SIFT_create(nfeatures=most, enable_precise_upscale=True, **thresholds)  # type: ignore[attr-defined]  # no stub
+    sift = cv2.SIFT_create(nfeatures=max_count, enable_precise_upscale=True, **thresholds)  # type: ignore[attr-defined]  # no stub
     keypoints, descriptors = sift.detectAndCompute(grey, mask)
     rows = [(*keypoint.pt, keypoint.size, keypoint.angle) for keypoint in keypoints]
     numbers = torch.tensor(rows, dtype=torch.float64).reshape(-1, 4)

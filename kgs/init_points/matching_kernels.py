@@ -17,7 +17,7 @@ BANDS = 16
 INFINITY = f32(np.inf)
 
 
-def mutual_nearest(threads, lines, places, descriptors, line_distance, ratio, most):
+def mutual_nearest(threads, lines, places, descriptors, line_distance, ratio, max_distance):
     """Descriptor distances and indices in both views, `(K,)`, of mutual nearest neighbours that pass the ratio test."""
     n = len(lines)
     m = places.shape[1]
@@ -32,7 +32,7 @@ def mutual_nearest(threads, lines, places, descriptors, line_distance, ratio, mo
     rival2 = np.partition(np.concatenate([near2, rival2]), 1, axis=0)[1]
     match2 = np.take_along_axis(match2, near2.argmin(0)[None], 0)[0]
     clear = near1 < f32(ratio) * np.minimum(rival1, rival2[match1])
-    rows = np.nonzero(clear & (near1 < f32(most)) & (match2[match1] == np.arange(n)))[0]
+    rows = np.nonzero(clear & (near1 < f32(max_distance)) & (match2[match1] == np.arange(n)))[0]
     return near1[rows], rows, match1[rows]
 
 

@@ -15,7 +15,7 @@ from .plane_sweep import DepthMap
 
 PIXELS = 16_000  # of one view that are looked up: one in four, or fewer of a large image
 SIDE = 4  # of a patch, in these pixels
-LEAST = 4  # of its 16 pixels, which a view has to agree on
+MIN_AGREED = 4  # of its 16 pixels, which a view has to agree on
 VIEWS = 3  # that a patch needs: without one of them there is a mean of two
 MIN_PATCHES = 200  # fewer say nothing about a scene
 
@@ -73,12 +73,12 @@ def _of_view(
     count = sums(one, everywhere)
     mean = sums(own, everywhere) / count.clamp_min(1)
     colors = mean[:, None].repeat(1, len(views), 1)
-    visible = (count >= LEAST).repeat(1, len(views))
+    visible = (count >= MIN_AGREED).repeat(1, len(views))
     for other, places, agrees in agreeing_views(geometry, maps, certain, rows, columns, view):
         difference = interpolate(images[other], places) - own
         shared = sums(one, agrees)
         colors[:, other] += sums(difference, agrees) / shared.clamp_min(1)
-        visible[:, other] &= ((shared >= LEAST) & (shared >= 0.5 * count))[:, 0]
+        visible[:, other] &= ((shared >= MIN_AGREED) & (shared >= 0.5 * count))[:, 0]
     wanted = visible.sum(1) >= VIEWS
     centers = sums(points, everywhere)[wanted] / count[wanted]
     directions = normalize(centers[:, None] - geometry.centers, dim=-1).float()

@@ -107,10 +107,10 @@ def _homographies(geometry: ViewGeometry, view: int, other: int, inverse: Tensor
     return homographies
 
 
-def _refine(cost: Tensor, unsmoothed: Tensor, inverse: Tensor, most: float) -> DepthMap:
+def _refine(cost: Tensor, unsmoothed: Tensor, inverse: Tensor, max_depth: float) -> DepthMap:
     """The depth of the cheapest plane of each pixel, refined by the lowest point of a parabola through three planes.
 
-    It is at most `most`, also where the inverse depth is 0 or below.
+    It is at most `max_depth`, also where the inverse depth is 0 or below.
     """
     best = cost.argmin(0)
     inner = best.clamp(1, len(cost) - 2)
@@ -119,5 +119,5 @@ def _refine(cost: Tensor, unsmoothed: Tensor, inverse: Tensor, most: float) -> D
     right = cost.gather(0, (inner + 1)[None])[0]
     bend = left - 2 * middle + right
     offset = torch.where(bend > 1e-9, 0.5 * (left - right) / bend.clamp_min(1e-9), 0.0).clamp(-0.5, 0.5)
-    depths = 1.0 / (float(inverse[0]) + (inner + offset) * float(inverse[1] - inverse[0])).clamp_min(1.0 / most)
+    depths = 1.0 / (float(inverse[0]) + (inner + offset) * float(inverse[1] - inverse[0])).clamp_min(1.0 / max_depth)
     return DepthMap(depths, 1.0 - unsmoothed.gather(0, best[None])[0], (best > 0) & (best < len(cost) - 1))

@@ -138,11 +138,11 @@ def _add_paths(cost: Tensor, grey: Tensor, total: Tensor, flip: bool, slant: int
         if last >= 0:
             previous = before.roll(slant, 1)
             edge = (grey[row] - grey[last].roll(slant)).abs()
-            least = previous.amin(0)
-            cheapest = torch.minimum(previous, least + (JUMP * EDGE / (EDGE + edge)).clamp_min(MIN_JUMP))
+            cheapest_before = previous.amin(0)
+            cheapest = torch.minimum(previous, cheapest_before + (JUMP * EDGE / (EDGE + edge)).clamp_min(MIN_JUMP))
             cheapest[1:] = torch.minimum(cheapest[1:], previous[:-1] + STEP)
             cheapest[:-1] = torch.minimum(cheapest[:-1], previous[1:] + STEP)
-            more = cheapest - least
+            more = cheapest - cheapest_before
             if slant:
                 more[:, 0 if slant > 0 else -1] = 0.0  # paths begin at the border
             path += more

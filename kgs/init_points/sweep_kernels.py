@@ -232,15 +232,15 @@ def add_paths(begin, end, cost, grey, dy, dx, prices, total):
                         path[1 + d] = here[d]
                 else:
                     slope = abs(grey[y, x] - grey[y - dy, x - dx])
-                    least = lowest[k]
+                    cheapest_before = lowest[k]
                     price = ONE / (edge + slope) * jump
-                    anywhere = least + (price if price > min_jump else min_jump)
+                    anywhere = cheapest_before + (price if price > min_jump else min_jump)
                     for d in range(planes):
                         cheapest = previous[1 + d] if previous[1 + d] < anywhere else anywhere
                         left, right = previous[d] + step, previous[2 + d] + step
                         cheapest = left if left < cheapest else cheapest
                         cheapest = right if right < cheapest else cheapest
-                        path[1 + d] = here[d] + (cheapest - least)
+                        path[1 + d] = here[d] + (cheapest - cheapest_before)
                 lanes[:] = INFINITY
                 for d in range(0, size, LANES):
                     for lane in range(LANES):

@@ -61,9 +61,9 @@ def findings(frame: pd.DataFrame) -> list[str]:
     if best_others:
         worst, _, best, gain = min(best_others, key=lambda one: one[-1].mean)
         mean = f"{fmean(one[-1].mean for one in best_others):+.2f} dB in the mean of {len(best_others)} scenes"
-        least = f"{gain.text(labels=True)} dB on {worst} (over {best})"
+        smallest = f"{gain.text(labels=True)} dB on {worst} (over {best})"
         how = "that one is picked after the fact on the same test views, which flatters it"
-        sentences.append(f"The default over the best other method of each scene: {mean}, at worst {least}; {how}.")
+        sentences.append(f"The default over the best other method of each scene: {mean}, at worst {smallest}; {how}.")
     noise = noise_floor(wide(frame, PSNR))
     if noise.freedom:
         single = f"two single runs differ by up to {noise.between_means(1):.2f} dB"

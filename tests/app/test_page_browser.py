@@ -273,9 +273,9 @@ def test_roaming_ends_where_the_splat_leaves_the_stage(opened: Browser) -> None:
 
     for sign in (1, -1):
         opened.run("viewer.place(viewer.scene.first); viewer.isRoaming = true")
-        least = min(1 / 3, covered() / 2)
+        minimum = min(1 / 3, covered() / 2)
         opened.run(f"for (let i = 0; i < 40; i++) viewer.turn({0.1 * sign}, 0)")
-        assert covered() >= least - 0.01
+        assert covered() >= minimum - 0.01
         at_once = opened.run("viewer.eye.position")
         opened.run(f"viewer.place(viewer.scene.first); viewer.turn({4.0 * sign}, 0)")  # one long drag ends there, too
         assert opened.run("viewer.eye.position") == pytest.approx(at_once, abs=1e-6)

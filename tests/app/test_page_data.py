@@ -114,15 +114,15 @@ def test_strays_move_nothing_else(cameras: Any, places: tuple[float, ...]) -> No
 
 def largest_shift(exact: Gaussians, shown: Gaussians, cameras: Any) -> float:
     """Of the centres in the pictures that show them, in pixels."""
-    most = 0.0
+    maximum = 0.0
     for extrinsics, k in zip(cameras.extrinsics, cameras.intrinsics, strict=True):
         pixels = []
         for each in (exact, shown):
             points = each.means @ extrinsics[:3, :3].T + extrinsics[:3, 3]
             pixels.append(points[:, :2] / points[:, 2:] * k[[0, 1], [0, 1]] + k[:2, 2])
         inside = (pixels[0] > 0).all(1) & (pixels[0] < torch.tensor(SIZE[::-1])).all(1)
-        most = max(most, float((pixels[1] - pixels[0])[inside].norm(dim=1).max()))
-    return most
+        maximum = max(maximum, float((pixels[1] - pixels[0])[inside].norm(dim=1).max()))
+    return maximum
 
 
 @pytest.mark.parametrize("name", ["colors", "scales"])
@@ -159,11 +159,11 @@ def test_a_limit_costs_bits_then_harmonics_then_the_least_gaussians(cameras: Any
     whole = pack(exact, cameras, 10**7)
     assert whole.left_out == ""
     sizes, words = [], []
-    for most in (len(whole.content) - 1, len(whole.content) // 2, 3000):
-        packed = pack(exact, cameras, most, lambda: torch.arange(400.0))
+    for maximum in (len(whole.content) - 1, len(whole.content) // 2, 3000):
+        packed = pack(exact, cameras, maximum, lambda: torch.arange(400.0))
         sizes.append(len(packed.content))
         words.append(packed.left_out)
-        assert sizes[-1] <= most
+        assert sizes[-1] <= maximum
     assert words[0] == "8-bit numbers"
     assert words[1].startswith("8-bit numbers, harmonics up to degree ")
     assert words[2].endswith("of 400 Gaussians")

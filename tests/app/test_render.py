@@ -74,12 +74,12 @@ def test_a_second_render_replaces_the_first(splat, llff):
 
 
 def test_pictures_and_pages_are_shrunk_and_have_a_background(splat, llff, tmp_path):
-    for background, least in (("black", 0.0), ("white", 1.0)):
+    for background, minimum in (("black", 0.0), ("white", 1.0)):
         out = tmp_path / background
         render(splat, cameras=llff, out=out, downscale=2.0, background=background)
         pictures = [cv2.imread(str(path)) for path in sorted(out.glob("*.png"))]
         assert {picture.shape for picture in pictures} == {(15, 20, 3)}
-        assert {int(picture[0, 0].max()) for picture in pictures} == {round(255 * least)}  # no Gaussian is there
+        assert {int(picture[0, 0].max()) for picture in pictures} == {round(255 * minimum)}  # no Gaussian is there
     page(splat, cameras=llff, out=tmp_path / "page.html", downscale=2.0, background="white")
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "20 × 15 pixels" in text

@@ -53,7 +53,7 @@ def test_other_first_pairs_until_all_photos_are_placed(look):
     assert pairs == sorted(pairs, key=MATCHES.__getitem__, reverse=True)
     assert all({"b.png", "d.png", "e.png"} & set(pair) for pair in pairs)
     assert len({call["seed"] for call in calls} | {5}) == 4
-    assert [call["fewest"] for call in calls] == [1, 1, 5]  # a try has to place more than the best so far
+    assert [call["min_placed"] for call in calls] == [1, 1, 5]  # a try has to place more than the best so far
 
 
 def test_tries_are_few_and_change_nothing_where_they_find_no_more(look):
@@ -79,7 +79,7 @@ def test_a_photo_is_placed_by_own_points_beside_the_cameras_of_the_others(look):
     start = calls[-1]["start"]
     assert set(start.rotations) == {"a", "b", "c"}  # neither those to place nor the one with few points
     assert start.reconstruction is other.reconstruction
-    assert calls[-1]["fewest"] == 4
+    assert calls[-1]["min_placed"] == 4
     _, calls = look(cameras("ab"), cameras("bcdef"), "acdef", [])
     assert not any("start" in call for call in calls)  # one camera holds nothing
 

@@ -16,7 +16,7 @@ SIZES = [(1, 1, 11, 11), (2, 3, 11, 17), (1, 3, 16, 11), (1, 2, 33, 129), (3, 1,
 def _many_pieces(kernel_backend, monkeypatch):
     """Small pictures in many pieces, as large ones are."""
     if kernel_backend == "numba":
-        monkeypatch.setattr("kgs.backends.cpu.loss.LEAST", 1)
+        monkeypatch.setattr("kgs.backends.cpu.loss.MIN_PIXELS", 1)
 
 
 def make_pair(shape, seed=0):

@@ -132,7 +132,7 @@ def test_exact_sum_is_the_reference(seed, dtype, image_bound, bound, sh_degree):
 @pytest.mark.parametrize(
     ("dtype", "image_bound", "bound"), [(torch.float32, 5e-6, 1e-5), (torch.float64, 1e-10, 1e-10)]
 )
-def test_default_thresholds_are_the_reference_away_from_decisions(dtype, image_bound, bound, opacities, most):
+def test_default_thresholds_are_the_reference_away_from_decisions(dtype, image_bound, bound, opacities, maximum):
     share = []
     for seed in range(3):
         error, at_doubtful, doubtful, gradient_errors = against_reference(seed, dtype, (TH, STOP), 1, opacities)
@@ -140,7 +140,7 @@ def test_default_thresholds_are_the_reference_away_from_decisions(dtype, image_b
         assert at_doubtful <= 1e-2
         assert max(gradient_errors) <= bound
         share.append(doubtful)
-    assert sum(share) / len(share) < most
+    assert sum(share) / len(share) < maximum
 
 
 def test_median_depth_is_where_less_than_half_the_light_remains():

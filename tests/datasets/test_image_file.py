@@ -148,12 +148,12 @@ def test_transparent_tiffs_keep_their_colours(
 
 @TIFFS
 def test_colours_that_a_tiff_multiplies_by_alpha_are_divided_by_it(tmp_path: Path, kind: type[np.uint8]) -> None:
-    most = np.iinfo(kind).max
-    colors, alpha = pixels(kind, 3), np.maximum(pixels(kind, 1), most // 2)
+    maximum = np.iinfo(kind).max
+    colors, alpha = pixels(kind, 3), np.maximum(pixels(kind, 1), maximum // 2)
     alpha[0, 0] = 0
-    stored_colors = np.round(colors / most * alpha).astype(kind)
+    stored_colors = np.round(colors / maximum * alpha).astype(kind)
     image = read_image(stored(tmp_path / "a.tif", tiff(np.concatenate([stored_colors, alpha], axis=2), alpha=1)))
-    np.testing.assert_allclose(image[1:, ..., :3], colors[1:] / most, atol=1.1 / most)
+    np.testing.assert_allclose(image[1:, ..., :3], colors[1:] / maximum, atol=1.1 / maximum)
     assert np.isfinite(image).all()
     assert not image[0, 0].any()
 
@@ -177,9 +177,9 @@ def test_a_tiff_in_which_white_is_zero(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("bits", [1, 2, 4, 8, 16])
 def test_the_grey_that_a_png_makes_transparent(tmp_path: Path, bits: int) -> None:
-    most = 2**bits - 1
-    clear = most // 3 if bits > 1 else 1
-    values = [clear, most - clear]
+    maximum = 2**bits - 1
+    clear = maximum // 3 if bits > 1 else 1
+    values = [clear, maximum - clear]
     row = int("".join(f"{value:0{bits}b}" for value in values).ljust(8, "0"), 2)
     rows = (b"\0" + row.to_bytes(max(1, bits // 4), "big")) * 2
     chunk = png_chunk(b"tRNS", struct.pack(">H", clear))
@@ -187,7 +187,7 @@ def test_the_grey_that_a_png_makes_transparent(tmp_path: Path, bits: int) -> Non
     head = png_chunk(b"IHDR", struct.pack(">IIBBBBB", 2, 2, bits, 0, 0, 0, 0))
     image = read_image(stored(tmp_path / "a.png", data[:8] + head + chunk + data[33:]))
     assert image.shape == (2, 2, 4)
-    np.testing.assert_allclose(image[..., 0], np.broadcast_to(np.array(values) / most, (2, 2)), atol=1e-6)
+    np.testing.assert_allclose(image[..., 0], np.broadcast_to(np.array(values) / maximum, (2, 2)), atol=1e-6)
     np.testing.assert_array_equal(image[..., 3], [[0, 1]] * 2)
 
 

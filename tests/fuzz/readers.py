@@ -85,9 +85,9 @@ def _read_image(folder: Path, suffix: str) -> None:
 
 def _read_ply(folder: Path) -> None:
     for name, value in load_ply(folder / "splat.ply").state_dict().items():
-        least = -math.inf if name in ("log_scales", "opacity_logits") else -3.5e38  # of a flat disc, of an opacity of 0
-        most = math.inf if name == "opacity_logits" else 3.5e38
-        check_range(name, value, least, most)
+        minimum = -math.inf if name in ("log_scales", "opacity_logits") else -3.5e38  # of a flat disc, of an opacity of 0
+        maximum = math.inf if name == "opacity_logits" else 3.5e38
+        check_range(name, value, minimum, maximum)
 
 
 def check_scene(scene: Scene) -> None:

@@ -20,7 +20,7 @@ DTYPES = [torch.float32, torch.float64]
 @pytest.fixture(autouse=True)
 def many_bands(monkeypatch):
     """Small pictures in many bands, as large ones are: in each file of tests that imports it."""
-    monkeypatch.setattr("kgs.backends.cpu.binning.LEAST", 1)
+    monkeypatch.setattr("kgs.backends.cpu.binning.MIN_ENTRIES", 1)
 
 
 def drawn(n=300, size=(40, 56)):

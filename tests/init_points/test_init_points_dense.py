@@ -290,8 +290,8 @@ def test_views_are_halved_until_planes_lie_close_together(views: Views, monkeypa
         assert small_enough(views, 2.0, 10.0).images.shape[-1] == width // 2**halvings
     monkeypatch.setattr(dense, "MAX_SHIFT", math.inf)
     samples = views.images[:, 0].numel() * plane_count(shift)
-    for most, halvings in ((samples, 0), (samples - 1, 1)):
-        monkeypatch.setattr(dense, "MAX_SAMPLES", most)
+    for maximum, halvings in ((samples, 0), (samples - 1, 1)):
+        monkeypatch.setattr(dense, "MAX_SAMPLES", maximum)
         assert small_enough(views, 2.0, 10.0).images.shape[-1] == width // 2**halvings
     monkeypatch.setattr(dense, "MAX_PIXELS", views.images[0, 0].numel() // 2)
     assert small_enough(views, 2.0, 10.0).images.shape[-1] == width // 2

@@ -7,7 +7,7 @@ import torch
 from init_point_scenes import as_views, cameras
 
 from kgs.geometry import ViewGeometry
-from kgs.init_points.patches import LEAST, PatchColors, patch_colors
+from kgs.init_points.patches import MIN_AGREED, PatchColors, patch_colors
 from kgs.init_points.plane_sweep import DepthMap
 
 WIDTH, HEIGHT, DEPTH = 40, 32, 4.0
@@ -58,7 +58,7 @@ def test_only_views_that_agree_show_a_patch() -> None:
     assert len(three) > 10
     assert torch.equal(three.visible, torch.tensor([True, True, True, False]).expand_as(three.visible))
     few = nowhere.clone()
-    few[: 2 * LEAST - 2 : 2, 0] = True  # one pixel too few of those that are looked up
+    few[: 2 * MIN_AGREED - 2 : 2, 0] = True  # one pixel too few of those that are looked up
     assert len(patches_of([few, EVERYWHERE, EVERYWHERE, EVERYWHERE])) == len(
         patches_of([nowhere, EVERYWHERE, EVERYWHERE, EVERYWHERE])
     )

@@ -22,7 +22,7 @@ from kgs.fit.haze import FRONT, HAZE, WINDOW
 from kgs.fit.overlap import MAX_STEPS, STEPS_OF_A_PHOTO
 from kgs.fit.plan import MANY as USUAL
 from kgs.fit.plan import with_step_defaults
-from kgs.init_points.dense import FEWEST, MOST, MAX_OF_FEW_VIEWS, PIXELS_OF_A_POINT
+from kgs.init_points.dense import MIN_POINTS, MAX_POINTS, MAX_POINTS_FEW_VIEWS, PIXELS_OF_A_POINT
 from kgs.metrics.lpips import Lpips
 
 ROOT = Path(__file__).parents[2]
@@ -101,12 +101,12 @@ NUMBERS = [
     ("docs/layer.md", "The paper has p = #", [PAPER.drop]),
     ("docs/layer.md", "is p = #, with nothing dropped in the last #", [DROP, AUTO.no_drop_steps]),
     ("docs/comparison.md", "steps of a full run | # for up to three photos, up to # for more", STEPS_OF_BOTH),
-    ("docs/comparison.md", "initial points, of which there are # to #, or #", [FEWEST, MOST, MAX_OF_FEW_VIEWS]),
+    ("docs/comparison.md", "initial points, of which there are # to #, or #", [MIN_POINTS, MAX_POINTS, MAX_POINTS_FEW_VIEWS]),
     ("docs/how-to-photograph.md", "A fit takes # steps for up to three photos and [up to # for more", STEPS_OF_BOTH),
     ("docs/measured.md", "three seeds): # steps from # of the same", [PAPER.steps, PAPER.init_points]),
     ("docs/command.md", "| low | # | # | #, the", [LOW.size, LOW.entries["init_points"], LOW.entries["steps"]]),
-    ("docs/command.md", "# to #, one for every # pixels", [FEWEST, MOST, PIXELS_OF_A_POINT]),
-    ("docs/command.md", "three photos to # | # for up to three photos, for", [MAX_OF_FEW_VIEWS, FEW.steps]),
+    ("docs/command.md", "# to #, one for every # pixels", [MIN_POINTS, MAX_POINTS, PIXELS_OF_A_POINT]),
+    ("docs/command.md", "three photos to # | # for up to three photos, for", [MAX_POINTS_FEW_VIEWS, FEW.steps]),
     ("docs/command.md", "for more [# to #]", STEPS_OF_BOTH),
     ("docs/command.md", "| normal | # for unposed", [DETAILS["normal"].size]),
     ("docs/how-to-photograph.md", "and fitted at # on a CPU", [DETAILS["normal"].size]),
@@ -122,8 +122,8 @@ NUMBERS = [
     ("docs/recipe.md", "by # in a window of #x7", [HAZE, WINDOW]),
     ("docs/recipe.md", "lie nearer than # times the median", [FRONT]),
     ("docs/recipe.md", "| initial points | # of", [PAPER.init_points]),
-    ("docs/recipe.md", "every # pixels on whose depth two views agree, # to #", [PIXELS_OF_A_POINT, FEWEST, MOST]),
-    ("docs/recipe.md", "(up to three photos to #), each", [MAX_OF_FEW_VIEWS]),
+    ("docs/recipe.md", "every # pixels on whose depth two views agree, # to #", [PIXELS_OF_A_POINT, MIN_POINTS, MAX_POINTS]),
+    ("docs/recipe.md", "(up to three photos to #), each", [MAX_POINTS_FEW_VIEWS]),
     ("docs/recipe.md", "| scales #, quaternions # | scales", [PAPER.recipe.lr_scales, PAPER.recipe.lr_quats]),
     ("docs/recipe.md", "| scales #, quaternions # | in", [AUTO.recipe.lr_scales, AUTO.recipe.lr_quats]),
     ("docs/recipe.md", "L1 + # (1 - SSIM) | L1 + # (1", [PAPER.recipe.dssim_weight, AUTO.recipe.dssim_weight]),

@@ -95,8 +95,8 @@ def on_threads(dtype: torch.dtype) -> Iterator[Result]:
 def under_a_budget(dtype: torch.dtype) -> Iterator[Result]:
     """The image alone: gradients of a Gaussian are then summed in another order."""
     scene = ordinary(300, (64, 64), scales=60.0, opacities=0.02)
-    for most in (2**30, 2**21):
-        yield render(scene, dtype, max_bytes=most)[0], {}
+    for maximum in (2**30, 2**21):
+        yield render(scene, dtype, max_bytes=maximum)[0], {}
 
 
 CASES: dict[str, tuple[str, str, Callable[[torch.dtype], Iterator[Result]]]] = {

@@ -134,15 +134,15 @@ def check_photos(
     name = "size" if downscale is None else "downscale"
     factor = max(1.0, max(width, height) / size) if size is not None else downscale or 1.0
     reduced = [max(1, round(side / factor)) for side in (width, height)]
-    for side, least, pixels in (("longer", SMALLEST, max(reduced)), ("shorter", shortest, min(reduced))):
-        if pixels < least:
+    for side, minimum, pixels in (("longer", SMALLEST, max(reduced)), ("shorter", shortest, min(reduced))):
+        if pixels < minimum:
             got = f"{reduced[0]}x{reduced[1]} of {width}x{height}"
-            raise ValueError(f"{name}: expected {least} pixels or more of the {side} side, got {got}")
+            raise ValueError(f"{name}: expected {minimum} pixels or more of the {side} side, got {got}")
 
 
 def _check_views(views: int | None, hold_out: int | None, count: int, what: str) -> None:
     """Raise a ValueError for more training views than `count` photos leave whose cameras kgs finds."""
-    most = count - len(held_out_between_ends(count - 2, hold_out)) if hold_out else count
-    if views is not None and views > most:
-        rest = f" of which {count - most} are held out" if hold_out else ""
-        raise ValueError(f"views: expected at most {most} of {count} {what}{rest}, got {views}")
+    maximum = count - len(held_out_between_ends(count - 2, hold_out)) if hold_out else count
+    if views is not None and views > maximum:
+        rest = f" of which {count - maximum} are held out" if hold_out else ""
+        raise ValueError(f"views: expected at most {maximum} of {count} {what}{rest}, got {views}")

@@ -201,7 +201,7 @@ def check_fit(
 ) -> None:
     """Check the arguments of `kgs fit`."""
     from kgs.app.files.outputs import check_folder
-    from kgs.app.sfm.find import FEWEST, find_video
+    from kgs.app.sfm.find import MIN_PHOTOS, find_video
     from kgs.datasets.folders import layout_of
     from kgs.datasets.options import check_options
     from kgs.metrics.weights import weight_files
@@ -219,8 +219,8 @@ def check_fit(
     if views is not None and views < 1:
         raise ValueError(f"views: expected a whole number of at least 1, got {views}")
     check_options(downscale, hold_out)
-    if frames is not None and frames < FEWEST:
-        raise ValueError(f"frames: expected at least {FEWEST}, got {frames}")
+    if frames is not None and frames < MIN_PHOTOS:
+        raise ValueError(f"frames: expected at least {MIN_PHOTOS}, got {frames}")
     if frames is not None and find_video(scene) is None:
         raise ValueError("frames: expected a video to take them from, got photos")
     unposed = is_unposed(scene)

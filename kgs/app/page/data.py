@@ -272,13 +272,13 @@ def _spread_out(name: str, values: Array, bits: int) -> Column:
 
 def _pixels_per_unit(means: Array, cameras: PinholeCamera, near_plane: float) -> float:
     """The largest shift of a centre in an image that shows it, in pixels, when it moves by one world unit."""
-    most = 0.0
+    maximum = 0.0
     for k, pose, size in lenses(cameras):
         points = visible_points(means, k, pose, size, near_plane)
         tangents = points[:, :2] / points[:, 2:]
         shifts = np.abs(k.diagonal()[:2]).max() / points[:, 2] * np.sqrt(1 + (tangents**2).sum(axis=1))
-        most = max(most, float(shifts.max(initial=0.0)))
-    return most
+        maximum = max(maximum, float(shifts.max(initial=0.0)))
+    return maximum
 
 
 def _opacity_times_area(values: dict[str, Array]) -> Array:

@@ -79,7 +79,7 @@ def verdict(runs: Runs) -> str:
 
 def _in_words(psnr: float) -> str:
     """What a PSNR looks like, see `_LEVELS`."""
-    return next(words for least, words in _LEVELS if psnr >= least)
+    return next(words for minimum, words in _LEVELS if psnr >= minimum)
 
 
 def measure_table(runs: Runs) -> tuple[list[str], list[list[str]]]:

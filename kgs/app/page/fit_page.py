@@ -300,8 +300,8 @@ def _poses_note(metrics: Mapping[str, Any]) -> list[str]:
     if poses is None:
         return []
     mean = f"{poses['degrees']:.2f} degrees and {100 * poses['depths']:.2f} % of the median depth"
-    most = f"{poses['max_degrees']:.2f} degrees and {100 * poses['max_depths']:.2f} %"
-    return [f"The fit moved the training cameras by {mean} in the mean, and by at most {most}."]
+    largest = f"{poses['max_degrees']:.2f} degrees and {100 * poses['max_depths']:.2f} %"
+    return [f"The fit moved the training cameras by {mean} in the mean, and by at most {largest}."]
 
 
 def _finer_note(scene: Scene, request: SceneRequest) -> list[str]:
@@ -318,6 +318,6 @@ def _all_cameras(*parts: Views) -> PinholeCamera:
     return PinholeCamera(*(torch.cat([getattr(views.cameras, name) for views in parts]) for name in names))
 
 
-def spread(count: int, most: int) -> list[int]:
-    """Indices of at most `most` of `count` items, spread evenly, with the first and the last one."""
-    return select_evenly(count, min(count, most)) if count else []
+def spread(count: int, max_count: int) -> list[int]:
+    """Indices of at most `max_count` of `count` items, spread evenly, with the first and the last one."""
+    return select_evenly(count, min(count, max_count)) if count else []

@@ -20,7 +20,7 @@ from kgs.datasets.folders import (
 from kgs.datasets.mask_files import find_mask_files
 from kgs.errors import DataError, listed
 
-FEWEST = 3
+MIN_PHOTOS = 3
 MAX_FRAMES = 36  # of a video, where twelve would be too far apart
 _LISTED = 10
 CONVERT = (
@@ -61,8 +61,8 @@ def find_photos(folder: Path) -> list[Path]:
         else:
             reason = f"expected photos ({' '.join(IMAGE_SUFFIXES)}), found none. {ADVICE}"
         raise DataError(folder, "", ". ".join([reason, *folders.unused_files(folder), *_nameless(folder)]))
-    if len(paths) < FEWEST:
-        reason = f"expected at least {FEWEST} photos, found {len(paths)} ({listed_files(paths)}). {ADVICE}"
+    if len(paths) < MIN_PHOTOS:
+        reason = f"expected at least {MIN_PHOTOS} photos, found {len(paths)} ({listed_files(paths)}). {ADVICE}"
         raise DataError(folder, "", ". ".join([reason, *_nameless(folder)]))
     return paths
 

@@ -11,7 +11,7 @@ from itertools import combinations
 
 from kgs.errors import DataError
 
-from .find import FEWEST, listed_files
+from .find import MIN_PHOTOS, listed_files
 from .gates import MIN_POINTS, MAX_DEGREES, MAX_RATIO, SAME_PLACE, Pairs, angle_between, gap, groups_of, matches_of
 from .map import Cameras, PairGeometry
 from .read import OpenPhoto, by_shape
@@ -21,7 +21,7 @@ def unlike_others(photos: list[OpenPhoto]) -> dict[str, str]:
     """Photos that are copies, or of another shape than most without a focal length in their Exif, and why.
 
     Raises:
-        DataError: most photos are panoramas, there are fewer than `FEWEST` without copies, or no shape is that of most.
+        DataError: most photos are panoramas, there are fewer than `MIN_PHOTOS` without copies, or no shape is that of most.
     """
     folder = photos[0].path.parent
     panoramas = [photo.path for photo in photos if photo.is_panorama]
@@ -32,7 +32,7 @@ def unlike_others(photos: list[OpenPhoto]) -> dict[str, str]:
     first = {photo.sha256: photo.name for photo in reversed(photos)}
     copied = {photo.name: first[photo.sha256] for photo in photos if first[photo.sha256] != photo.name}
     left = {name: f"it is the same photo as {other}" for name, other in copied.items()}
-    if copied and len(photos) - len(left) < FEWEST:
+    if copied and len(photos) - len(left) < MIN_PHOTOS:
         name, other = next(iter(copied.items()))
         reason = f"is the same photo as {other}: remove one of them. A second look needs a second place"
         raise DataError(photos[0].path.with_name(name), "", reason)
@@ -52,7 +52,7 @@ def _usual(groups: Mapping[str, list[OpenPhoto]]) -> str | None:
     """The largest group, or None if others would be left out, and it has too few photos or no more than another one."""
     usual = max(groups, key=lambda name: len(groups[name]))
     sizes = sorted((len(group) for group in groups.values()), reverse=True)
-    if _of_unknown_lens(groups, usual) and (sizes[0] < FEWEST or sizes[0] == sizes[1]):
+    if _of_unknown_lens(groups, usual) and (sizes[0] < MIN_PHOTOS or sizes[0] == sizes[1]):
         return None
     return usual
 
@@ -89,11 +89,11 @@ def without_overlap(
     groups = groups_of(kept, pairs)
     if len(groups) > 1 and len(groups[0]) > len(groups[1]):
         left |= {name: _too_few_matches(name, groups[0], pairs) for group in groups[1:] for name in group}
-    return left if len(names) - len(left) >= FEWEST else {}
+    return left if len(names) - len(left) >= MIN_PHOTOS else {}
 
 
 def without_cameras(solutions: Sequence[Cameras | None], names: Sequence[str], pairs: Pairs) -> dict[str, str]:
-    """Photos whose cameras cannot be trusted while those of at least `FEWEST` others can, and why.
+    """Photos whose cameras cannot be trusted while those of at least `MIN_PHOTOS` others can, and why.
 
     Args:
         solutions: what two solvers found.
@@ -105,7 +105,7 @@ def without_cameras(solutions: Sequence[Cameras | None], names: Sequence[str], p
         return {}
     # without photos that were placed badly the solvers may agree about the others
     left = _placed_badly(first, second, names, pairs) or _disputed(first, second, list(names))
-    return left if len(names) - len(left) >= FEWEST else {}
+    return left if len(names) - len(left) >= MIN_PHOTOS else {}
 
 
 def doubtful(solutions: Sequence[Cameras | None], names: Sequence[str], pairs: Pairs) -> set[str]:
@@ -167,8 +167,8 @@ def _seen_well(cameras: Cameras, names: Sequence[str]) -> tuple[int, int]:
 
 
 def _too_few_matches(name: str, group: Sequence[str], pairs: Pairs) -> str:
-    most = max(matches_of(pairs, name, other) for other in group)
-    said = f"it has at most {most} matches with the others" if most else "it shows nothing that the others show"
+    maximum = max(matches_of(pairs, name, other) for other in group)
+    said = f"it has at most {maximum} matches with the others" if maximum else "it shows nothing that the others show"
     return f"{said}{_advice(name, [*group, name], pairs)}"
 
 

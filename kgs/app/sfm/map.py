@@ -128,7 +128,7 @@ def solve(
     *,
     first_pair: tuple[str, str] | None = None,
     start: Cameras | None = None,
-    fewest: int = 0,
+    min_placed: int = 0,
 ) -> Cameras | None:
     """Cameras and points from verified matches, of as many photos as can be placed; None if no pair can be.
 
@@ -145,7 +145,7 @@ def solve(
         first_pair: the images in the database that are placed first; None: the mapper chooses.
         start: cameras of other matches that are there before any photo is placed. Their points are computed anew, from
             the matches of the database, and then the cameras are adjusted to these.
-        fewest: how many photos have to be placed; where the first round places fewer, the result is None.
+        min_placed: how many photos have to be placed; where the first round places fewer, the result is None.
     """
     best = None
     error = 0.0
@@ -167,7 +167,7 @@ def solve(
                 scene = _map(pycolmap, database, images, work, options, not is_held)
             else:
                 scene = _map_from(pycolmap, database, images, work, options, _started(file, start, names))
-            if scene is None or (best is not None and _is_worse(scene, best)) or scene.num_reg_images() < fewest:
+            if scene is None or (best is not None and _is_worse(scene, best)) or scene.num_reg_images() < min_placed:
                 break
             best, error = _adjust(scene, is_held)
             changes = [_change(lenses[camera_id], lens) for camera_id, lens in best.cameras.items()]

@@ -35,10 +35,10 @@ class PhotoKeypoints(NamedTuple):
     frames: Tensor  # `(1, N, 2, 3)`, Kornia's local affine frames
 
 
-def find_keypoints(photo: Photo, most: int) -> PhotoKeypoints:
-    """The strongest SIFT keypoints of a photo where it is kept, up to `most`; nothing is random."""
+def find_keypoints(photo: Photo, max_count: int) -> PhotoKeypoints:
+    """The strongest SIFT keypoints of a photo where it is kept, up to `max_count`; nothing is random."""
     factor = 2 if max(photo.size) < SMALL else 1
-    keypoints = root_sift(photo.grey(), most, factor, photo.mask, contrastThreshold=_CONTRAST)
+    keypoints = root_sift(photo.grey(), max_count, factor, photo.mask, contrastThreshold=_CONTRAST)
     places = (keypoints.places + 0.5).float()
     sizes = keypoints.sizes.float()
     angles = keypoints.angles.float()
@@ -56,8 +56,8 @@ def write_matches(database: Path, photos: list[Photo], names: list[str], bar: Pr
         bar: wraps the loops to show their progress, see :mod:`kgs.progress`.
     """
     # The cost of matching grows with the squares of both counts, so many photos get fewer keypoints each.
-    most = min(MAX_KEYPOINTS, max(MIN_KEYPOINTS, ALL_KEYPOINTS // len(photos)))
-    keypoints = [find_keypoints(photo, most) for photo in bar(photos, "keypoints", "photo")]
+    max_count = min(MAX_KEYPOINTS, max(MIN_KEYPOINTS, ALL_KEYPOINTS // len(photos)))
+    keypoints = [find_keypoints(photo, max_count) for photo in bar(photos, "keypoints", "photo")]
     area = photos[0].size[::-1]
     with _open(database) as file:
         ids = _write_photos(file, photos, names)

@@ -51,15 +51,15 @@ def look_again(
     were_placed = len(seen_well(found, photos)) == len(photos)
     tries = min(_MAX_TRIES, max(_MIN_TRIES, _PLACINGS // len(photos)))
     for number, pair in enumerate(_first_pairs(database, names, doubtful)[:tries], 1):
-        fewest = min(len(seen_well(best, photos)) + 1, len(photos))
-        cameras = solve(database, images, work, seed + number, names, focals, first_pair=pair, fewest=fewest)
+        min_placed = min(len(seen_well(best, photos)) + 1, len(photos))
+        cameras = solve(database, images, work, seed + number, names, focals, first_pair=pair, min_placed=minimum)
         best = _better(best, cameras, photos)
         if not were_placed and len(seen_well(best, photos)) == len(photos):
             return best
     placed = (seen_well(best, photos) & seen_well(other, photos)) - doubtful
     if other is not None and len(placed) >= 2:
         start = other._replace(rotations={name: other.rotations[name] for name in placed})
-        cameras = solve(database, images, work, seed, names, focals, start=start, fewest=len(placed) + 1)
+        cameras = solve(database, images, work, seed, names, focals, start=start, min_placed=len(placed) + 1)
         best = _better(best, cameras, photos)
     return best
 

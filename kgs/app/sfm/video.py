@@ -26,7 +26,7 @@ from kgs.app.files.outputs import write_png
 from kgs.errors import DataError
 from kgs.progress import ProgressBar
 
-from .find import FEWEST, MAX_FRAMES
+from .find import MIN_PHOTOS, MAX_FRAMES
 from .match import DEFAULT_FOCAL
 from .read import sharpness
 
@@ -70,12 +70,12 @@ def take_frames(
     """
     frames = _look(video, bar)
     way = frames[-1].way
-    least = _STEP * ((count or FEWEST) - 1)
-    if way < least or len(frames) < FEWEST:
-        expected = f"expected a video in which the camera moves by {least:g} degrees or more"
+    min_way = _STEP * ((count or MIN_PHOTOS) - 1)
+    if way < min_way or len(frames) < MIN_PHOTOS:
+        expected = f"expected a video in which the camera moves by {min_way:g} degrees or more"
         raise DataError(video, "", f"{expected}, got {way:.1f} degrees in {len(frames)} frames")
     if count is None:
-        count = max(FEWEST, min(FRAMES, round(way / MIN_DEGREES) + 1))
+        count = max(MIN_PHOTOS, min(FRAMES, round(way / MIN_DEGREES) + 1))
         count = max(count, min(MAX_FRAMES, math.ceil(way / MAX_DEGREES) + 1))
     indices = _sharpest(frames, count)
     paths = []

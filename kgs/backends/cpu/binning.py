@@ -32,7 +32,7 @@ from .binning_kernels import (
 )
 
 BANDS = 16
-LEAST = 4096  # entries of a band: the fixed work of a band costs as much as some hundreds of entries
+MIN_ENTRIES = 4096  # entries of a band: the fixed work of a band costs as much as some hundreds of entries
 
 
 def table_width(channels: int, median_depth: bool) -> int:
@@ -141,7 +141,7 @@ class TileCoverage:
             starts, spans = self._all_spans
         work = np.cumsum(self.entries_per_row + self.grid[1])
         before = work[begin - 1] if begin else 0
-        count = max(1, round(min(BANDS, work[-1] / LEAST) * (work[end - 1] - before) / work[-1]))
+        count = max(1, round(min(BANDS, work[-1] / MIN_ENTRIES) * (work[end - 1] - before) / work[-1]))
         targets = before + np.arange(1, count) * (work[end - 1] - before) / count
         bounds = np.unique([begin, *(np.searchsorted(work, targets) + 1), end])
         offsets = np.zeros(len(bounds), np.int64)

@@ -167,9 +167,9 @@ class CpuCompositor(Compositor):
 
 def _blocks(features: int) -> list[tuple[int, int]]:
     """Where blocks of features begin, and how many each has: what kernels are compiled for, the last padded."""
-    most = kernels.WIDTHS[-1]
-    begins = range(0, max(features, 1), most)
-    return [(begin, next(w for w in kernels.WIDTHS if w >= min(features - begin, most))) for begin in begins]
+    maximum = kernels.WIDTHS[-1]
+    begins = range(0, max(features, 1), maximum)
+    return [(begin, next(w for w in kernels.WIDTHS if w >= min(features - begin, maximum))) for begin in begins]
 
 
 def _nothing(dimensions: int) -> Floats:

@@ -85,17 +85,17 @@ def gather(table, entries, first, n, corner, feature, channels, layers):
 
 
 @inline
-def find_strips(layers, n, least, strips):
+def find_strips(layers, n, log_threshold, strips):
     """Set bit k of `strips[s]`, for the n layers of a chunk, where layer k may reach strip s: elsewhere its alpha is 0.
 
-    With log2 alpha = l - |v|^2, v = W (dx, dy), and `least` the log2 of the threshold, a layer reaches a pixel where
-    |v|^2 <= l - least. On a row, dy is given, and |v|^2 is least at dx = -dy (w0 . w1) / (w0 . w0), w0 and w1 being the
+    With log2 alpha = l - |v|^2, v = W (dx, dy), and `log_threshold` the log2 of the threshold, a layer reaches a pixel where
+    |v|^2 <= l - log_threshold. On a row, dy is given, and |v|^2 is least at dx = -dy (w0 . w1) / (w0 . w0), w0 and w1 being the
     columns of W, or at the end of the row that is closer to it. A strip is missed where both of its rows are.
 
     What is missed must be 0 with all roundings, so the bound is wider. Let M^2 = far_x^2 |w0|^2 + far_y^2 |w1|^2 with
     the largest |dx| and |dy| of the tile, and u = 2^-24. Here and in `alpha_of`, together, the error of v is below
     e = 8 sqrt(2) u M, and |v|^2 >= (1 - t) |v + e|^2 - e^2 / t for any t; with t = 2^-10, e^2 / t is 2^-31 M^2. The
-    other roundings, of the exponent, of 2^x and of `least`, are below 1e-4. A bound that is not a number or infinite is
+    other roundings, of the exponent, of 2^x and of `log_threshold`, are below 1e-4. A bound that is not a number or infinite is
     exceeded by nothing, and all strips are reached. In the forward pass a feature that is not finite therefore spreads
     to all pixels of the strips that its layer reaches, but not beyond.
     """
@@ -106,7 +106,7 @@ def find_strips(layers, n, least, strips):
         xx, yy = ax * ax + bx * bx, ay * ay + by * by
         slope = (ax * ay + bx * by) / xx
         far_x, far_y = magnitude(x) + _CENTRE, magnitude(y) + _CENTRE
-        bound = exponent - least + _MARGIN + _MARGIN_FAR * (far_x * far_x * xx + far_y * far_y * yy)
+        bound = exponent - log_threshold + _MARGIN + _MARGIN_FAR * (far_x * far_x * xx + far_y * far_y * yy)
         bound = bound * _WIDER
         for row in range(SIZE):
             dy = f32(row) - _CENTRE - y
@@ -156,7 +156,7 @@ def composite_forward(
     F, median = len(channels), len(depths) > 0
     pixels = scratch(2 * P)
     place_pixels(pixels)
-    least = f32(math.log2(threshold))
+    log_threshold = f32(math.log2(threshold))
     found = np.empty(STRIPS, np.int64)
     s = scratch((2 + F) * P)  # T, sums, depth of the last layer before which T was at least one half
     layers = scratch(K * ROW)
@@ -184,7 +184,7 @@ def composite_forward(
                     starts[chunk, p] = s[p]
             n = min(K, last - e)
             gather(table, entries, e, n, corner, feature, F, layers)
-            find_strips(layers, n, least, found)
+            find_strips(layers, n, log_threshold, found)
             if keep:
                 for i in range(STRIPS):
                     strips[chunk, i] = found[i]

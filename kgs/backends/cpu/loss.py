@@ -11,7 +11,7 @@ from kgs.torch_threads import thread_count
 
 from .loss_kernels import BAND, RADIUS, fill_moments, ssim_gradient, ssim_maps, total_gradient
 
-PIECES, LEAST = 16, 8192  # for the threads; pixels of one
+PIECES, MIN_PIXELS = 16, 8192  # for the threads; pixels of one
 
 
 def loss_and_gradient(
@@ -65,4 +65,4 @@ def _half(taps: list[float]) -> tuple[np.float32, ...]:
 def _division(image: Array) -> tuple[int, int]:
     """How many bands of rows all channels have, and into how many pieces they are divided."""
     channels, height, _ = image.shape
-    return channels * -(-height // BAND), min(PIECES, -(-image.size // LEAST))
+    return channels * -(-height // BAND), min(PIECES, -(-image.size // MIN_PIXELS))

@@ -133,9 +133,9 @@ def fill_entries(
     while left > 0:
         first, count = _span(row, row < stop, x, y, half, cut, slope, across, inverse, rightmost, width)
         tile = (top + row - begin) * columns + first
-        most = tl.max(count, 0)
+        maximum = tl.max(count, 0)
         c = 0
-        while c < most:
+        while c < maximum:
             fits = (c < count) & (at + c < full)
             tl.store(tiles + at + c, tile + c, mask=fits)
             tl.store(ranks + at + c, i, mask=fits)

@@ -30,12 +30,12 @@ def check_gaussians(means, quats, scales, opacities, colors, n, views, features,
         all_finite &= is_finite(tl.load(scales + g * 3 + i, mask=inside, other=0.0))
     for i in tl.static_range(4):
         all_finite &= is_finite(tl.load(quats + g * 4 + i, mask=inside, other=0.0))
-    most = tl.zeros((BLOCK,), tl.float32)
+    maximum = tl.zeros((BLOCK,), tl.float32)
     view = 0
     while view < views:
         opacity = tl.load(opacities + view * n + g, mask=inside, other=0.0)
         all_finite &= is_finite(opacity)
-        most = tl.maximum(most, opacity)
+        maximum = tl.maximum(maximum, opacity)
         view += 1
     f = tl.arange(0, 16)
     row = colors + g.to(tl.int64)[:, None] * features + f[None, :]
@@ -45,7 +45,7 @@ def check_gaussians(means, quats, scales, opacities, colors, n, views, features,
         all_finite &= tl.min(is_finite(value).to(tl.int32), 1) > 0
         first += 16
     tl.store(finite + g, all_finite.to(tl.int8), mask=inside)
-    tl.store(largest + b, tl.max(tl.where(all_finite, most, 0.0), 0))
+    tl.store(largest + b, tl.max(tl.where(all_finite, maximum, 0.0), 0))
 
 
 @triton.jit
