@@ -17,7 +17,7 @@ from kgs.datasets.scene import Views
 from kgs.geometry import ViewGeometry
 from kgs.progress import ProgressBar, silent
 
-from .agreement import consistent_pixels, average_depths
+from .agreement import average_depths, consistent_pixels
 from .patches import PatchColors, patch_colors
 from .plane_sweep import DepthMap, plane_count, planes_wanted, sweep_depths
 

@@ -139,7 +139,7 @@ def _memory_of(points: Path, steps: int) -> tuple[float, int, int]:
     import torch
 
     from kgs.datasets import synthetic_scene
-    from kgs.fit.plan import make_plan, gaussian_limit
+    from kgs.fit.plan import gaussian_limit, make_plan
     from kgs.fit.run import choose_points
     from kgs.fit.trainer import Trainer
 

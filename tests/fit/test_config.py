@@ -13,7 +13,7 @@ import torch
 from kgs import RasterOptions
 from kgs.datasets import synthetic_scene
 from kgs.fit.config import PAPER, PRESETS, FitConfig, Recipe
-from kgs.fit.plan import expected_memory, make_plan, gaussian_limit, make_schedule, with_step_defaults
+from kgs.fit.plan import expected_memory, gaussian_limit, make_plan, make_schedule, with_step_defaults
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from kgs.fit.targets import targets
 from kgs.fit.trainer import Trainer
 from kgs.init_points import InitialPoints, initial_points
 from kgs.init_points.patches import MIN_PATCHES, PatchColors
-from kgs.metrics.evaluate import clipped_psnr, evaluate, measure_again, color_corrected
+from kgs.metrics.evaluate import clipped_psnr, color_corrected, evaluate, measure_again
 
 GAINS = torch.tensor([[0.5, 0.5, 0.5], [0.8, 0.8, 0.8], [1.25, 1.25, 1.25], [1.1, 1.0, 0.8]])
 

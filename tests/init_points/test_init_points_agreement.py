@@ -9,7 +9,7 @@ from init_point_scenes import cameras
 
 from kgs.geometry import ViewGeometry
 from kgs.init_points import agreement
-from kgs.init_points.agreement import consistent_pixels, average_depths
+from kgs.init_points.agreement import average_depths, consistent_pixels
 from kgs.init_points.plane_sweep import DepthMap
 
 WIDTH, HEIGHT, DEPTH = 40, 30, 4.0

@@ -22,7 +22,7 @@ from kgs.fit.haze import FRONT, HAZE, WINDOW
 from kgs.fit.overlap import MAX_STEPS, STEPS_OF_A_PHOTO
 from kgs.fit.plan import MANY as USUAL
 from kgs.fit.plan import with_step_defaults
-from kgs.init_points.dense import MIN_POINTS, MAX_POINTS, MAX_POINTS_FEW_VIEWS, PIXELS_OF_A_POINT
+from kgs.init_points.dense import MAX_POINTS, MAX_POINTS_FEW_VIEWS, MIN_POINTS, PIXELS_OF_A_POINT
 from kgs.metrics.lpips import Lpips
 
 ROOT = Path(__file__).parents[2]

@@ -12,7 +12,7 @@ from itertools import combinations
 from kgs.errors import DataError
 
 from .find import MIN_PHOTOS, listed_files
-from .gates import MIN_POINTS, MAX_DEGREES, MAX_RATIO, SAME_PLACE, Pairs, angle_between, gap, groups_of, matches_of
+from .gates import MAX_DEGREES, MAX_RATIO, MIN_POINTS, SAME_PLACE, Pairs, angle_between, gap, groups_of, matches_of
 from .map import Cameras, PairGeometry
 from .read import OpenPhoto, by_shape
 

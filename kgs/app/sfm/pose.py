@@ -27,7 +27,7 @@ from kgs.progress import ProgressBar, silent
 
 from .agree import agreed_cameras, say_left_out
 from .find import find_photos, find_video
-from .gates import MIN_POINTS, FOCAL_RANGE, MIN_RISE, MAX_DEGREES, MAX_RATIO
+from .gates import FOCAL_RANGE, MAX_DEGREES, MAX_RATIO, MIN_POINTS, MIN_RISE
 from .leave_out import unlike_others
 from .map import Cameras, quiet_pycolmap
 from .match import exif_focal

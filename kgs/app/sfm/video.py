@@ -26,7 +26,7 @@ from kgs.app.files.outputs import write_png
 from kgs.errors import DataError
 from kgs.progress import ProgressBar
 
-from .find import MIN_PHOTOS, MAX_FRAMES
+from .find import MAX_FRAMES, MIN_PHOTOS
 from .match import DEFAULT_FOCAL
 from .read import sharpness
 
