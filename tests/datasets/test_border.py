@@ -53,12 +53,12 @@ def test_the_scene_is_not_taken_for_a_border(scene):
     photos = scene.train.images.clone()
     assert find_border_mask(photos) is None
     assert find_border_mask(photos * behind(left=0, top=8.0, right=0)) is None  # too wide
-    assert border_mask(torch.rand(2, 3, 5, 5)) is None  # too small
+    assert find_border_mask(torch.rand(2, 3, 5, 5)) is None  # too small
     assert find_border_mask(photos * behind() * 0.02) is None  # too dark to tell
     photos[0, :, :2] = 0.0  # in one photo alone
     assert find_border_mask(photos) is None
     assert find_border_mask(scene.train.images[:1] * behind()) is None  # one photo tells nothing
-    assert border_mask(torch.zeros(3, 3, 144, 192)) is None
+    assert find_border_mask(torch.zeros(3, 3, 144, 192)) is None
 
 
 def with_border(scene, light, known=True):

@@ -52,7 +52,7 @@ def look_again(
     tries = min(_MAX_TRIES, max(_MIN_TRIES, _PLACINGS // len(photos)))
     for number, pair in enumerate(_first_pairs(database, names, doubtful)[:tries], 1):
         min_placed = min(len(seen_well(best, photos)) + 1, len(photos))
-        cameras = solve(database, images, work, seed + number, names, focals, first_pair=pair, min_placed=minimum)
+        cameras = solve(database, images, work, seed + number, names, focals, first_pair=pair, min_placed=min_placed)
         best = _better(best, cameras, photos)
         if not were_placed and len(seen_well(best, photos)) == len(photos):
             return best

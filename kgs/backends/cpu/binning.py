@@ -92,20 +92,20 @@ class TileCoverage:
         self.grid = (-(-height // SIZE), -(-width // SIZE))
         self.total_rows = cameras * self.grid[0]
         self._width = width
-        self._over = partial(over, threads)
+        self._parallel_for = partial(parallel_for, threads)
         means2d, factors, opacities, _, depths, _ = inputs
         m = len(depths)
         rows = array((m, 2), np.int32)
         ids = array(m, np.int32)
         self.ranks = array(m, np.int32)
-        self._over(m, find_rows, means2d, factors, opacities, eps2d, alpha_threshold, height, rows)
+        self._parallel_for(m, find_rows, means2d, factors, opacities, eps2d, alpha_threshold, height, rows)
         n = sort_by_depth(depths.view(np.uint32), rows, ids, self.ranks)
         self.ids = ids[:n]
         self.heads = array((n, 2), np.int32)
         self.geometry = array((n, 8))
         self.table = array((n, table_width(channels, median_depth)))
         sizes = (eps2d, alpha_threshold, self.grid[0], rows, channels)
-        self._over(n, fill_tables, self.ids, *inputs, *sizes, self.heads, self.geometry, self.table)
+        self._parallel_for(n, fill_tables, self.ids, *inputs, *sizes, self.heads, self.geometry, self.table)
         self._count(max_spans)
 
     def _count(self, max_spans: int) -> None:
@@ -128,7 +128,7 @@ class TileCoverage:
         begin_spans(heads, begin, end, starts)
         spans = array(starts[-1], np.int32)
         rest = (begin, end, self.grid[0], self._width, heads, self.geometry[low:high], starts, spans)
-        self._over(high - low, find_spans, *rest)
+        self._parallel_for(high - low, find_spans, *rest)
         return starts, spans
 
     def row_slice(self, begin: int, end: int) -> RowSlice:
