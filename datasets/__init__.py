@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from kgs.lazy import lazy_names
+from kgs._support.lazy import lazy_names
 
 if TYPE_CHECKING:
     from .load import load_scene

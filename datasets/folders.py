@@ -11,7 +11,7 @@ from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
-from kgs.errors import DataError
+from kgs._support.errors import DataError
 
 _JPEG = (".jpg", ".jpeg", ".jpe", ".jfif", ".jif", ".pjpeg", ".pjp")
 IMAGE_SUFFIXES = (".png", *_JPEG, ".webp", ".bmp", ".dib", ".tif", ".tiff")

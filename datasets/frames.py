@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kgs.errors import DataError
+from kgs._support.errors import DataError
 
 from .image_file import ImageFile
 from .images import Intrinsics

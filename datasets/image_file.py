@@ -21,7 +21,7 @@ from PIL import BmpImagePlugin, JpegImagePlugin, PngImagePlugin, TiffImagePlugin
 from PIL.Image import Exif
 from PIL.ImageFile import ImageFile as Opened
 
-from kgs.errors import DataError, listed
+from kgs._support.errors import DataError, listed
 
 from . import folders
 from .color_profile import ADOBE_RGB, Colors, Profile, cmyk_to_rgb, colors_of, is_usable, to_srgb

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kgs.errors import DataError, listed
+from kgs._support.errors import DataError, listed
 
 from .border import with_border
 from .folders import CAMERAS_REPORT
@@ -162,7 +162,9 @@ def _mask_notes(frames: Sequence[Frame], train: Views, transparent: bool) -> lis
     masked = sum(frame.mask is not None for frame in frames)
     if not masked:
         return []
-    share = "" if train.valid_mask is None else f", {1 - float(train.valid_mask.float().mean()):.0%} of the training pixels"
+    share = (
+        "" if train.valid_mask is None else f", {1 - float(train.valid_mask.float().mean()):.0%} of the training pixels"
+    )
     meaning = "treated as empty" if transparent else f"ignored{share}"
     return [f"masks of {masked} of {len(frames)} photos: black pixels are {meaning}"]
 
@@ -245,7 +247,12 @@ def _is_turned(width: int, height: int, scale: _Scale) -> bool:
 
 
 def _views(
-    frames: Sequence[Frame], scales: Sequence[_Scale], offset: Tensor, background: Tensor, photos: bool, transparent: bool
+    frames: Sequence[Frame],
+    scales: Sequence[_Scale],
+    offset: Tensor,
+    background: Tensor,
+    photos: bool,
+    transparent: bool,
 ) -> list[Views]:
     """The frames as views, once for each scale; their photos are decoded once, or not at all."""
     count = len(frames)

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from kgs.errors import DataError, listed
+from kgs._support.errors import DataError, listed
 
 from .folders import (
     IMAGE_SUFFIXES,

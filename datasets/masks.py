@@ -10,7 +10,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from kgs.errors import DataError
+from kgs._support.errors import DataError
 
 from .image_file import Image, ImageFile
 from .images import Intrinsics

@@ -11,7 +11,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from kgs.errors import DataError
+from kgs._support.errors import DataError
 
 
 def pinholes(intrinsics: Tensor, extrinsics: Tensor, size: tuple[int, int]) -> PinholeCamera:
@@ -80,11 +80,11 @@ class Views:
         if self.alphas is not None and tuple(self.alphas.shape) != (count, 1, height, width):
             raise ValueError(f"alphas: expected shape ({count}, 1, {height}, {width}), got {tuple(self.alphas.shape)}")
         if self.border_mask is not None and tuple(self.border_mask.shape) != (height, width):
-            raise ValueError(
-                f"border_mask: expected shape ({height}, {width}), got {tuple(self.border_mask.shape)}"
-            )
+            raise ValueError(f"border_mask: expected shape ({height}, {width}), got {tuple(self.border_mask.shape)}")
         if self.valid_mask is not None and tuple(self.valid_mask.shape) != (count, height, width):
-            raise ValueError(f"valid_mask: expected shape ({count}, {height}, {width}), got {tuple(self.valid_mask.shape)}")
+            raise ValueError(
+                f"valid_mask: expected shape ({count}, {height}, {width}), got {tuple(self.valid_mask.shape)}"
+            )
         if self.gains is not None and (tuple(self.gains.shape) != (count, 3) or not bool((self.gains > 0).all())):
             raise ValueError(f"gains: expected numbers above 0 of shape ({count}, 3), got {self.gains.tolist()!s:.80}")
         if self.turned is not None and len(self.turned) != count:
@@ -241,7 +241,9 @@ class Scene:
         if len(self.train) == 0:
             raise DataError(self.root, "train", "expected at least one training view, got none")
         if self.train_full_size is not None and self.train_full_size.names != self.train.names:
-            raise ValueError(f"train_full_size: expected the views {self.train.names} as train, got {self.train_full_size.names}")
+            raise ValueError(
+                f"train_full_size: expected the views {self.train.names} as train, got {self.train_full_size.names}"
+            )
         shapes = tuple(self.points.shape), tuple(self.point_colors.shape)
         if shapes[0] != shapes[1] or len(shapes[0]) != 2 or shapes[0][1] != 3:
             raise ValueError(f"points, point_colors: expected two of shape (P, 3), got {shapes[0]} and {shapes[1]}")

@@ -6,9 +6,9 @@ import sys
 if "torch" not in sys.modules and "GOMP_SPINCOUNT" not in os.environ:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read when torch is loaded: threads that wait yield their core
 
-from .errors import DataError, TrainingDiverged
-from .lazy import TYPE_CHECKING, lazy_names
-from .version import __version__ as __version__
+from ._support.errors import DataError, TrainingDiverged
+from ._support.lazy import TYPE_CHECKING, lazy_names
+from ._support.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from .camera import PosedCamera, pinhole_cameras

@@ -16,8 +16,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kgs._support.json_files import write_whole
 from kgs.harmonics import SH_C0
-from kgs.json_files import write_whole
 from kgs.model import GaussianModel
 from kgs.ply import as_vector
 from kgs.types import SH_SIZES, check_kind

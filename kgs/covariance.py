@@ -125,7 +125,9 @@ class _HalfAxes(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> Tensor:
         if torch.is_grad_enabled():
-            raise RuntimeError("covariance_factors: expected backward without create_graph, there is no second derivative")
+            raise RuntimeError(
+                "covariance_factors: expected backward without create_graph, there is no second derivative"
+            )
         (factors,) = ctx.saved_tensors
         flat = factors.diagonal(dim1=1, dim2=2) == 0  # the gradient is 0 there, too
         whole = factors + torch.diag_embed(flat.double())

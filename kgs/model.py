@@ -13,10 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ._support.memory import empty
+from ._support.torch_threads import torch_on_all_threads
 from .geometry import log_spacing
 from .harmonics import SH_C0
-from .memory import empty
-from .torch_threads import torch_on_all_threads
 from .types import SH_SIZES, Gaussians, check_tensor
 
 INITIAL_OPACITY = 0.1
@@ -199,7 +199,7 @@ class GaussianModel(nn.Module):
 
 
 class _JoinedBands(torch.autograd.Function):
-    """Concatenate `sh_dc` and the first bands of `sh_rest`, as `torch.cat` does, in buffers of `kgs.memory`."""
+    """Concatenate `sh_dc` and the first bands of `sh_rest`, as `torch.cat` does, in buffers of `kgs._support.memory`."""
 
     @staticmethod
     def forward(ctx: Any, sh_dc: Tensor, sh_rest: Tensor, bands: int) -> Tensor:

@@ -17,8 +17,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kgs.errors import DataError, warn
-from kgs.json_files import write_whole
+from kgs._support.errors import DataError, warn
+from kgs._support.json_files import write_whole
 from kgs.model import MAX_SH_DEGREE, GaussianModel
 from kgs.types import SH_SIZES, check_kind
 

@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ._support.memory import empty
 from .backends import check_backend
 from .camera import Cameras
-from .memory import empty
 from .projection import normals
 from .stages import composite, project
 from .types import Gaussians, RasterOptions, Rendering, check_kind, check_tensor, raster_options
@@ -163,7 +163,7 @@ def blend(image: Tensor, transmittance: Tensor, background: Tensor | None, name:
 
 
 class _OverColor(torch.autograd.Function):
-    """`addcmul` with one colour `(D,)`, with the same bits, in memory of `kgs.memory`."""
+    """`addcmul` with one colour `(D,)`, with the same bits, in memory of `kgs._support.memory`."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, transmittance: Tensor, color: Tensor) -> Tensor:

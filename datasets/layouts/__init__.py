@@ -3,9 +3,9 @@
 from dataclasses import replace
 from pathlib import Path
 
+from kgs._support.errors import DataError
 from kgs.datasets.folders import layout_of, unused_files, why_no_scene
 from kgs.datasets.frames import FrameSet
-from kgs.errors import DataError
 
 from .blender import load_blender
 from .colmap import load_colmap

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import torch
 
+from kgs._support.errors import DataError, listed
 from kgs.datasets.folders import find_models, image_folder
 from kgs.datasets.frames import Frame, FrameSet, PointCloud, find_file
 from kgs.datasets.image_file import ImageFile
 from kgs.datasets.images import Intrinsics
-from kgs.errors import DataError, listed
 
 from .colmap_model import ColmapCamera, model_file, read_cameras, read_images, read_points
 from .colmap_poses import registered_images

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from kgs._support.errors import DataError
 from kgs.datasets.image_file import read_bytes
-from kgs.errors import DataError
 
 T = TypeVar("T")
 STEMS = ("cameras", "images", "points3D")  # the files of a model that COLMAP needs

@@ -12,7 +12,7 @@ import kornia.geometry as kg
 import torch
 from torch import Tensor
 
-from kgs.errors import DataError
+from kgs._support.errors import DataError
 
 from .colmap_model import STEMS, ColmapImage, ColmapPose, model_file, read_frames, read_images, read_rigs
 

@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from kgs._support.errors import DataError
 from kgs.datasets.folders import find_models, image_folder, list_images
 from kgs.datasets.frames import Frame, FrameSet, PointCloud, path_inside
 from kgs.datasets.image_file import ImageFile
 from kgs.datasets.images import Intrinsics
-from kgs.errors import DataError
 
 from .colmap import largest_model, track_points
 from .colmap_poses import registered_images

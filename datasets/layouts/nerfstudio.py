@@ -14,13 +14,13 @@ import kornia.geometry as kg
 import torch
 from torch import Tensor
 
+from kgs._support.errors import DataError
+from kgs._support.json_files import is_number, read_json
 from kgs.datasets.folders import IMAGE_SUFFIXES
 from kgs.datasets.frames import Frame, FrameSet, find_file, path_inside
 from kgs.datasets.image_file import ImageFile
 from kgs.datasets.images import Intrinsics
 from kgs.datasets.masks import Mask
-from kgs.errors import DataError
-from kgs.json_files import is_number, read_json
 
 Object = dict[str, Any]
 Values = ChainMap[str, Any]  # what holds for a frame: its own entries, then those of the whole file

@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TextIO
 
-from kgs.errors import printable
+from kgs._support.errors import printable
 
 _FIRST_LINE = 2.0  # seconds
 VIEWER = "open {} in a viewer of 3DGS files, for example superspl.at/editor in a browser"  # a step to suggest

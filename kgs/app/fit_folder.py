@@ -12,6 +12,9 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
+from kgs._support.errors import DataError, printable
+from kgs._support.json_files import write_json
+from kgs._support.machine import check_packages
 from kgs.app.console import each, progress, say
 from kgs.app.files.cameras import as_taken
 from kgs.app.files.figures import write_curve
@@ -29,7 +32,6 @@ from kgs.app.files.results_folder import (
 from kgs.app.live import LivePage
 from kgs.app.page.fit_page import PAGE, write_own_page
 from kgs.datasets.scene import Scene
-from kgs.errors import DataError, printable
 from kgs.fit.checkpoint import save_checkpoint
 from kgs.fit.config import FitConfig, min_side
 from kgs.fit.fit import Fit
@@ -38,8 +40,6 @@ from kgs.fit.plan import Plan, expected_memory, gaussian_limit, make_plan
 from kgs.fit.prune import prune
 from kgs.fit.run import choose_points, decide
 from kgs.fit.trainer import Trainer
-from kgs.json_files import write_json
-from kgs.machine import check_packages
 from kgs.metrics.lpips import Lpips
 from kgs.ply import save_ply
 

@@ -8,10 +8,10 @@ from typing import Any, Self, TypeVar
 
 import torch
 
+from kgs._support.torch_threads import torch_on_one_thread
 from kgs.fit.fit import Fit
 from kgs.fit.trainer import Trainer
 from kgs.model import GaussianModel
-from kgs.torch_threads import torch_on_one_thread
 from kgs.types import Gaussians
 
 from .live_server import LiveServer

@@ -7,18 +7,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kgs._support.errors import DataError
+from kgs._support.json_files import read_json
 from kgs.app.files.publishing import complete
 from kgs.app.files.results_folder import CHECKPOINT
 from kgs.backends import former_or_auto
 from kgs.datasets.scene import Scene
-from kgs.errors import DataError
 from kgs.fit.checkpoint import newest_checkpoint
 from kgs.fit.config import FitConfig
 from kgs.fit.exposure import with_exposure
 from kgs.fit.fit import Fit
 from kgs.fit.poses import place_cameras
 from kgs.fit.state import check_plain
-from kgs.json_files import read_json
 from kgs.model import GaussianModel
 from kgs.types import RasterOptions
 

@@ -6,12 +6,12 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Self
 
+from kgs._support.errors import DataError
+from kgs._support.json_files import is_number
 from kgs.datasets.load import load_scene
 from kgs.datasets.options import MASK_MODES
 from kgs.datasets.scene import Scene
-from kgs.errors import DataError
 from kgs.fit.config import DETAILS
-from kgs.json_files import is_number
 
 _FINER = 1.1  # how many times as large photos must be to be worth a line
 

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import torch
 
 from kgs import backends
+from kgs._support.machine import check_device, versions
 from kgs.backends import Backend
 from kgs.backends.agreement import BOUND, disagreement
 from kgs.camera import move_camera
-from kgs.machine import check_device, versions
 from kgs.renderer import GaussianRenderer
 from kgs.types import RasterOptions
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import torch
 
-from kgs.json_files import write_json
-from kgs.machine import versions
+from kgs._support.json_files import write_json
+from kgs._support.machine import versions
 
 Row = dict[str, Any]
 

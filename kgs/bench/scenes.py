@@ -11,8 +11,8 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 import kgs.reference
+from kgs._support.errors import DataError
 from kgs.camera import pinhole_cameras
-from kgs.errors import DataError
 from kgs.harmonics import SH_C0
 from kgs.model import GaussianModel
 from kgs.types import Gaussians

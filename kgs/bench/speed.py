@@ -13,11 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kgs._support.machine import check_device, peak_rss_mb
 from kgs.backends import resolve
 from kgs.backends.torch.binning import bin_to_tiles
 from kgs.camera import move_camera
 from kgs.losses import photometric_loss, target_moments
-from kgs.machine import check_device, peak_rss_mb
 from kgs.renderer import GaussianRenderer
 from kgs.stages import composite, project
 

@@ -15,7 +15,7 @@ Examples:
 
 from typing import TYPE_CHECKING
 
-from kgs.lazy import lazy_names
+from kgs._support.lazy import lazy_names
 
 from .config import FitConfig
 

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kgs.torch_threads import torch_on_all_threads
+from kgs._support.torch_threads import torch_on_all_threads
 
 
 class Adam:

@@ -19,8 +19,8 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from kgs.errors import DataError
-from kgs.json_files import parse_json
+from kgs._support.errors import DataError
+from kgs._support.json_files import parse_json
 
 from .state import digest
 

@@ -16,11 +16,11 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from kgs._support.progress import ProgressBar, silent
 from kgs.camera import move_camera
 from kgs.geometry import NEIGHBOURS, camera_centers, log_spacing, nearest_pixels, project_points, typical_depths
 from kgs.metrics.evaluate import clipped_psnr
 from kgs.model import GaussianModel
-from kgs.progress import ProgressBar, silent
 from kgs.renderer import GaussianRenderer
 
 from .fit import Fit
@@ -159,7 +159,7 @@ def clean(fit: Fit, strength: float = 1.0, bar: ProgressBar = silent) -> Cleaned
     Args:
         fit: a splat with the cameras and photos that it was fitted to.
         strength: above 0, at most `MAX_STRENGTH`.
-        bar: wraps the loops to show their progress, see :mod:`kgs.progress`.
+        bar: wraps the loops to show their progress, see :mod:`kgs._support.progress`.
 
     Raises:
         ValueError: the scene was loaded without photos, the strength is out of range, or no Gaussian would be left.

@@ -19,8 +19,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kgs._support.errors import warn
 from kgs.datasets.scene import Scene
-from kgs.errors import warn
 from kgs.init_points import InitialPoints
 from kgs.init_points.patches import MIN_PATCHES, PatchColors
 

@@ -5,7 +5,7 @@ from typing import Any
 
 from torch import Tensor
 
-from kgs.machine import peak_rss_mb, versions
+from kgs._support.machine import peak_rss_mb, versions
 from kgs.metrics.coverage import Coverage
 from kgs.metrics.evaluate import evaluate, views_to_correct
 from kgs.metrics.lpips import Lpips

@@ -2,11 +2,11 @@
 
 from typing import Any
 
+from kgs._support.errors import DataError
+from kgs._support.progress import ProgressBar, silent
 from kgs.datasets.scene import Scene
-from kgs.errors import DataError
 from kgs.init_points import InitialPoints, initial_points
 from kgs.init_points.in_view import check_in_view
-from kgs.progress import ProgressBar, silent
 
 from .config import FitConfig
 from .exposure import decide_exposure
@@ -24,7 +24,7 @@ def fit_scene(scene: Scene, config: FitConfig | None = None, *, bar: ProgressBar
     Args:
         scene: posed training and test views; the test views are rendered only for the curve.
         config: the settings; None: the defaults.
-        bar: wraps the loops to show their progress, see :mod:`kgs.progress`.
+        bar: wraps the loops to show their progress, see :mod:`kgs._support.progress`.
 
     Raises:
         DataError: the scene, or the file of initial points, has none.
@@ -48,7 +48,7 @@ def choose_points(scene: Scene, config: FitConfig, bar: ProgressBar = silent) ->
     Args:
         scene: the scene to fit; test views are not used.
         config: the settings of the fit.
-        bar: wraps the loops to show their progress, see :mod:`kgs.progress`.
+        bar: wraps the loops to show their progress, see :mod:`kgs._support.progress`.
 
     Raises:
         DataError: the scene, or the file, has none, or no training image shows one.

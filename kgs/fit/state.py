@@ -11,12 +11,12 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
+from kgs._support.json_files import is_number
 from kgs.datasets.scene import Scene, Views
 from kgs.densify import Densifier
 from kgs.drop import DropGaussian
 from kgs.geometry import camera_extent, typical_depths
 from kgs.init_points import InitialPoints
-from kgs.json_files import is_number
 from kgs.model import PARAMETERS, GaussianModel
 
 from .adam import Adam

@@ -7,10 +7,10 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from kgs._support.memory import empty
 from kgs.camera import move_camera
 from kgs.datasets.scene import Scene, Views
 from kgs.losses import TargetMoments, target_moments
-from kgs.memory import empty
 
 _ABOVE_ONE = 1.0 + 2.0**-23  # the next float32: the gradient passes at 1, as it does in torch
 
@@ -45,7 +45,7 @@ class Target(NamedTuple):
 
 
 class _AtMostOne(torch.autograd.Function):
-    """`clamp(max=1)`, in memory of `kgs.memory`; torch makes two more images in the backward pass."""
+    """`clamp(max=1)`, in memory of `kgs._support.memory`; torch makes two more images in the backward pass."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor) -> Tensor:

@@ -7,10 +7,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from kgs._support.errors import warn
+from kgs._support.progress import ProgressBar, silent
 from kgs.datasets.scene import Views
-from kgs.errors import warn
 from kgs.geometry import ViewGeometry
-from kgs.progress import ProgressBar, silent
 from kgs.types import check_kind
 
 from .agreement import interpolate
@@ -78,7 +78,7 @@ def initial_points(
         file: the file of the kind "file".
         origin: subtracted from the points of the file, `(3,)`: the `offset` of the scene, if the file has its world
             coordinates.
-        bar: wraps the loops to show their progress, see :mod:`kgs.progress`.
+        bar: wraps the loops to show their progress, see :mod:`kgs._support.progress`.
         backend: one of :func:`kgs.backends.available`, for "dense" and "sift".
         draw: how "dense" points are drawn: "uniform", or "spread" evenly over the images.
 

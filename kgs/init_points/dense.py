@@ -13,9 +13,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kgs._support.progress import ProgressBar, silent
 from kgs.datasets.scene import Views
 from kgs.geometry import ViewGeometry
-from kgs.progress import ProgressBar, silent
 
 from .agreement import average_depths, consistent_pixels
 from .patches import PatchColors, patch_colors

@@ -4,9 +4,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kgs._support.progress import ProgressBar, silent
 from kgs.datasets.scene import Views
 from kgs.geometry import ViewGeometry, log_spacing, meeting_point
-from kgs.progress import ProgressBar, silent
 
 from .tracks import find_tracks
 from .triangulate import TrackedPoints, triangulate_certain
@@ -52,7 +52,9 @@ def _within_typical_depths(tracked: TrackedPoints) -> Tensor:
     visible = tracked.tracks.visible
     if not visible.any():
         return torch.zeros(len(tracked), dtype=torch.bool)
-    minimum, maximum = np.quantile(depths[visible], (0.01, 0.99)).tolist()  # torch.quantile takes up to 16 million values
+    minimum, maximum = np.quantile(
+        depths[visible], (0.01, 0.99)
+    ).tolist()  # torch.quantile takes up to 16 million values
     typical: Tensor = ((depths > 0.5 * minimum) & (depths < 2.0 * maximum)) | ~visible
     return typical.all(1)
 

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kgs.errors import DataError
+from kgs._support.errors import DataError
 from kgs.harmonics import SH_C0
 from kgs.ply import load_ply
 

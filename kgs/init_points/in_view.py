@@ -4,8 +4,8 @@ from os import PathLike
 
 from torch import Tensor
 
+from kgs._support.errors import DataError, listed, warn
 from kgs.datasets.scene import Views
-from kgs.errors import DataError, listed, warn
 from kgs.geometry import points_in_images
 
 

@@ -10,8 +10,8 @@ threads write to the same place.
 
 import numpy as np
 
-from kgs.compiled.kernel import ZERO, f32, jit
-from kgs.compiled.threads import parallel_for
+from kgs._support.compiled.kernel import ZERO, f32, jit
+from kgs._support.compiled.threads import parallel_for
 
 BANDS = 16
 INFINITY = f32(np.inf)

@@ -11,9 +11,9 @@ import torch
 from kornia.color import rgb_to_grayscale
 from torch import Tensor
 
+from kgs._support.progress import ProgressBar, silent
 from kgs.datasets.scene import Views
 from kgs.geometry import ViewGeometry
-from kgs.progress import ProgressBar, silent
 
 from .sweep_costs import sweep_costs
 

@@ -17,8 +17,8 @@ as written, so that the bits depend neither on threads nor on the processor.
 
 import numpy as np
 
-from kgs.compiled.kernel import ONE, ZERO, exact, f32, inline
-from kgs.compiled.threads import parallel_for
+from kgs._support.compiled.kernel import ONE, ZERO, exact, f32, inline
+from kgs._support.compiled.threads import parallel_for
 
 HALO = 3  # pixels of a window on each side of its centre
 SIDE = 2 * HALO + 1
@@ -34,7 +34,9 @@ def compare(threads, image, mean, variance, constants, others, homographies, cos
     """Write 1 minus the scores of all planes to `cost`."""
     height, width = mean.shape
     tiles = -(-height // TILE_ROWS) * -(-width // TILE_COLUMNS)
-    parallel_for(threads, tiles, compare_tiles, image, mean, variance, constants, others, homographies, cost, pieces=tiles)
+    parallel_for(
+        threads, tiles, compare_tiles, image, mean, variance, constants, others, homographies, cost, pieces=tiles
+    )
 
 
 def semi_global(threads, cost, grey, prices, total):

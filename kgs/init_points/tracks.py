@@ -14,9 +14,9 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from kornia.geometry.epipolar import fundamental_from_projections
 from torch import Tensor
 
+from kgs._support.progress import ProgressBar, silent
 from kgs.datasets.scene import Views
 from kgs.init_points.keypoints import root_sift
-from kgs.progress import ProgressBar, silent
 
 from .matching import match
 

@@ -20,8 +20,8 @@ import torch.nn.functional as F
 from kornia.metrics import psnr, ssim
 from torch import Tensor
 
+from kgs._support.errors import DataError
 from kgs.datasets.scene import Scene, Views
-from kgs.errors import DataError
 
 from .lpips import Lpips
 

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from kgs.errors import DataError
+from kgs._support.errors import DataError
 
 from .weights import weight_files
 

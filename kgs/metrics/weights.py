@@ -4,7 +4,7 @@ import zipfile
 from os import PathLike
 from pathlib import Path
 
-from kgs.errors import DataError
+from kgs._support.errors import DataError
 
 
 def weight_files(folder: str | PathLike[str]) -> tuple[Path, Path]:

@@ -18,12 +18,12 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from kgs._support.errors import DataError
 from kgs.bench.scenes import check_scenes
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.border import with_border
 from kgs.datasets.scene import Scene, Views
 from kgs.datasets.synthetic import synthetic_depths, views_beyond
-from kgs.errors import DataError
 from kgs.fit.run import choose_points
 from kgs.geometry import camera_centers
 from kgs.metrics.coverage import views_that_show

@@ -10,13 +10,14 @@ from typing import Any
 
 import torch
 
-import kgs.version
+import kgs._support.version
+from kgs._support.errors import DataError
+from kgs._support.machine import peak_rss_mb, revision
 from kgs.app.page.pictures import Picture, encoded
 from kgs.bench.scenes import SYNTHETIC
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.field import field_size
 from kgs.datasets.scene import Scene
-from kgs.errors import DataError
 from kgs.fit.config import PRESETS, FitConfig
 from kgs.fit.fit import Fit
 from kgs.fit.measures import measure
@@ -25,7 +26,6 @@ from kgs.fit.prune import prune
 from kgs.fit.run import choose_points, decide
 from kgs.fit.trainer import Trainer
 from kgs.init_points import InitialPoints
-from kgs.machine import peak_rss_mb, revision
 from kgs.metrics.evaluate import MEASURES
 from kgs.metrics.lpips import Lpips
 
@@ -100,7 +100,7 @@ def fit_and_measure(
         "wall_seconds": fit.history["seconds"],
         "peak_rss_mb": peak_rss_mb(),
         "versions": fit.metrics["versions"],
-        "revision": revision(Path(kgs.version.__file__).parent),
+        "revision": revision(Path(kgs._support.version.__file__).parent),
         "date": datetime.now(UTC).date().isoformat(),
     }
     return trainer, fit, stored

@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from kgs._support.errors import DataError
 from kgs.app.cli.options import Existing, Out
-from kgs.errors import DataError
 
 
 def study(

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from kgs.errors import DataError
+from kgs._support.errors import DataError
 
 from .grid import Cell
 from .published import PUBLISHED, SCENES_OF, benchmark_of

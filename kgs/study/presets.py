@@ -6,9 +6,9 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+from kgs._support.errors import DataError
 from kgs.bench.scenes import SYNTHETIC, check_scenes
 from kgs.datasets import load_scene
-from kgs.errors import DataError
 from kgs.fit.config import FitConfig
 
 from .cells import FULL

@@ -11,10 +11,10 @@ from typing import Any
 import pandas as pd
 from jinja2 import ChoiceLoader, Environment, PackageLoader
 
+from kgs._support.machine import revision
+from kgs._support.version import __version__
 from kgs.bench.output import markdown_table
 from kgs.bench.scenes import SYNTHETIC
-from kgs.machine import revision
-from kgs.version import __version__
 
 from .findings import findings
 from .pairs import COLUMNS, KEYS, ORIGIN, cells_frame

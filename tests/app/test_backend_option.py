@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from kgs import DataError, backends
+from kgs._support.json_files import read_json
 from kgs.app.files.results_folder import CHECKPOINT
 from kgs.app.fit_folder import fit_folder
 from kgs.app.saved_fit import load_fit
@@ -13,7 +14,6 @@ from kgs.app.scene_request import SceneRequest
 from kgs.fit import FitConfig, Trainer
 from kgs.fit.plan import make_plan
 from kgs.fit.prune import prune
-from kgs.json_files import read_json
 
 CONFIG = FitConfig(steps=3, evaluations=1, init="random", init_points=50)
 

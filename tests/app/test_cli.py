@@ -273,7 +273,7 @@ def test_versions(capsys, monkeypatch):
     lines = dict(line.split(" ", 1) for line in capsys.readouterr().out.splitlines())
     assert lines["kgs"] == kgs.__version__
     assert {"torch", "kornia", "opencv", "python", "machine"} <= lines.keys()
-    monkeypatch.setattr("kgs.machine.versions", lambda: {"kgs": "1"})
+    monkeypatch.setattr("kgs._support.machine.versions", lambda: {"kgs": "1"})
     assert run("--version") == 0
     assert "numba is not installed" in capsys.readouterr().out
 
@@ -381,7 +381,7 @@ def test_a_large_package_that_cannot_be_loaded(monkeypatch):
     assert "torch is installed, but cannot be loaded (libcudart" in cli.run._of_a_broken_package(caught.value)
     cli.run._import("numba")  # torch may do in its place
     with pytest.raises(ImportError, match="of ours"):
-        cli.run._of_a_broken_package(ImportError("of ours", name="kgs.errors"))
+        cli.run._of_a_broken_package(ImportError("of ours", name="kgs._support.errors"))
 
 
 @pytest.mark.slow

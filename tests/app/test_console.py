@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from kgs._support.errors import DataError
 from kgs.app.console import as_line, progress, say
-from kgs.errors import DataError
 
 
 class Terminal(io.StringIO):

@@ -17,6 +17,7 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
 import kgs
+from kgs._support.json_files import write_json
 from kgs.app.cli.render import render
 from kgs.app.files import exports
 from kgs.app.files.cameras import camera_list, upright
@@ -26,7 +27,6 @@ from kgs.app.files.publishing import is_own, replacing
 from kgs.datasets import Scene
 from kgs.fit import Fit
 from kgs.geometry import typical_depths
-from kgs.json_files import write_json
 
 POINTS = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0))
 SKY = 300 * torch.nn.functional.normalize(torch.randn(450, 3, generator=torch.Generator().manual_seed(1)), dim=1)

@@ -12,10 +12,10 @@ import pytest
 import torch
 from factories import random_views
 
+from kgs._support.machine import check_device, peak_rss_mb, revision
 from kgs.app.files.figures import DEFAULT, WITHOUT, write_curve, write_sheet
 from kgs.app.files.plot import psnr_plot
 from kgs.datasets.scene import Views
-from kgs.machine import check_device, peak_rss_mb, revision
 from kgs.study.plots import STYLES
 from kgs.study.presets import AUTO, OFF
 

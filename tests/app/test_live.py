@@ -19,11 +19,11 @@ import torch
 from browser import Browser
 from command import run
 
+from kgs._support.errors import TrainingDiverged
 from kgs.app import fit_folder as app
 from kgs.app import live
 from kgs.app.files.results_folder import CHECKPOINT
 from kgs.app.scene_request import SceneRequest
-from kgs.errors import TrainingDiverged
 from kgs.fit.checkpoint import load_checkpoint
 from kgs.fit.config import FitConfig, Recipe
 from kgs.fit.trainer import Trainer

@@ -7,10 +7,10 @@ import cv2
 import pytest
 import torch
 
+from kgs._support.errors import DataError
+from kgs._support.json_files import write_json, write_whole
 from kgs.app.files.outputs import check_folder, png_names, write_png
 from kgs.app.files.publishing import replacing
-from kgs.errors import DataError
-from kgs.json_files import write_json, write_whole
 
 
 def test_each_view_has_a_picture_of_its_own():

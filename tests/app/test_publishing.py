@@ -17,10 +17,10 @@ from typing import Any
 import pytest
 from command import run
 
+from kgs._support.json_files import write_json
 from kgs.app.files import publishing
 from kgs.app.files.publishing import MARKER, begin, complete, discard, enter, is_own, publish, read_marker, unpublished
 from kgs.app.files.publishing import replacing as replacing_files
-from kgs.json_files import write_json
 
 OLD = {"a.txt": "old", "test/0.txt": "old", "test/1.txt": "old"}
 NEW = {"a.txt": "new", "b.txt": "new", "test/0.txt": "new"}

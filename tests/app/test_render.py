@@ -11,12 +11,12 @@ from factories import random_model
 
 import kgs
 from kgs import GaussianRenderer, save_ply
+from kgs._support.errors import DataError
 from kgs.app.cli.page import check_page, page
 from kgs.app.cli.render import render
 from kgs.app.page import pictures
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.image_file import ImageFile
-from kgs.errors import DataError
 
 
 @pytest.fixture(scope="module")

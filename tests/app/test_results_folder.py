@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 import torch
 
+from kgs._support.errors import DataError, TrainingDiverged
 from kgs.app import fit_folder as app
 from kgs.app.cli.demo import check_demo
 from kgs.app.cli.evaluate import check_evaluate, evaluate
@@ -27,7 +28,6 @@ from kgs.app.files.results_folder import CHECKPOINT
 from kgs.app.saved_fit import load_fit
 from kgs.app.scene_request import SceneRequest
 from kgs.datasets.synthetic import synthetic_scene
-from kgs.errors import DataError, TrainingDiverged
 from kgs.fit import trainer as trainer_module
 from kgs.fit.checkpoint import load_checkpoint, previous, save_checkpoint
 from kgs.fit.config import DROP, FitConfig, Recipe

@@ -12,10 +12,10 @@ import pytest
 from init_point_scenes import WIDTH, focal_length
 from photo_folders import NAMES, close, planes, poses, write_photos, write_planes
 
+from kgs._support.errors import DataError
 from kgs.app.sfm import pose_photos
 from kgs.app.sfm.write import leveling, write_model
 from kgs.datasets import load_scene
-from kgs.errors import DataError
 
 pycolmap = pytest.importorskip("pycolmap")
 

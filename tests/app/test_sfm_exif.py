@@ -9,11 +9,11 @@ import PIL.Image
 import pytest
 from photo_folders import exif, planes, with_exif
 
+from kgs._support.errors import DataError
+from kgs._support.progress import silent
 from kgs.app.sfm.leave_out import unlike_others
 from kgs.app.sfm.read import Exif, open_photos, read_photos
 from kgs.datasets.image_file import ImageFile
-from kgs.errors import DataError
-from kgs.progress import silent
 
 JPEG = cv2.imencode(".jpg", planes()[0], [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
 

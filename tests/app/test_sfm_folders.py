@@ -15,14 +15,14 @@ from init_point_scenes import cameras, texture
 from limits import limited
 from photo_folders import close, planes, write_photos, write_planes
 
+from kgs._support.errors import DataError
+from kgs._support.progress import silent
 from kgs.app.files.outputs import write_png
 from kgs.app.files.publishing import publish, replacing
 from kgs.app.sfm import pose, pose_photos
 from kgs.app.sfm.find import find_photos, notes_on
 from kgs.app.sfm.pycolmap_processes import PycolmapProcesses
 from kgs.app.sfm.read import blurred, open_photos, read_photos, sharpness
-from kgs.errors import DataError
-from kgs.progress import silent
 
 pytest.importorskip("pycolmap")
 

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from kgs._support.errors import DataError
 from kgs.app.sfm import map as mapping
 from kgs.app.sfm.gates import (
     disagreement,
@@ -18,7 +19,6 @@ from kgs.app.sfm.gates import (
     why_no_cameras,
 )
 from kgs.app.sfm.map import Cameras, PairGeometry
-from kgs.errors import DataError
 
 NAMES = ["a", "b", "c"]
 PAIRS = {("a", "b"): 200, ("a", "c"): 40, ("b", "c"): 90}

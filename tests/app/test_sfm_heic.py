@@ -6,12 +6,12 @@ import zlib
 import numpy as np
 import pytest
 
+from kgs._support.errors import DataError
+from kgs._support.progress import silent
 from kgs.app.sfm.find import find_photos, list_photos, notes_on
 from kgs.app.sfm.read import open_photos, read_photos
 from kgs.datasets import folders
 from kgs.datasets.image_file import ImageFile, is_heic
-from kgs.errors import DataError
-from kgs.progress import silent
 
 pi_heif = pytest.importorskip("pi_heif")
 

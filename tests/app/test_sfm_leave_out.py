@@ -11,6 +11,7 @@ from init_point_scenes import cameras as views
 from kornia.geometry.camera import PinholeCamera
 from photo_folders import exif, planes, with_exif
 
+from kgs._support.progress import silent
 from kgs.app.sfm import pose_photos
 from kgs.app.sfm.gates import MAX_DEGREES, gap
 from kgs.app.sfm.leave_out import unlike_others, without_cameras, without_overlap
@@ -19,7 +20,6 @@ from kgs.app.sfm.match import lenses_of
 from kgs.app.sfm.read import open_photos, read_photos
 from kgs.datasets import load_scene
 from kgs.geometry import degrees_between
-from kgs.progress import silent
 
 NAMES = list("abcdef")
 PAIRS = dict.fromkeys(pairwise(NAMES), 200)

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from photo_folders import NAMES, exif, planes, with_exif, write_planes
 
+from kgs._support.progress import silent
 from kgs.app.sfm import pose_photos
 from kgs.app.sfm.read import open_photos, read_photos
 from kgs.datasets import load_scene
-from kgs.progress import silent
 
 pycolmap = pytest.importorskip("pycolmap")
 

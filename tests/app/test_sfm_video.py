@@ -12,10 +12,10 @@ import pytest
 from command import run
 from init_point_scenes import texture
 
+from kgs._support.errors import DataError
+from kgs._support.progress import silent
 from kgs.app.sfm.find import find_video
 from kgs.app.sfm.video import FRAMES, _Reader, take_frames
-from kgs.errors import DataError
-from kgs.progress import silent
 
 SIZE = (320, 240)
 FOCAL = 0.8 * SIZE[0]

@@ -9,15 +9,15 @@ import torch
 from command import one_line, run
 from kornia.geometry.conversions import rotation_matrix_to_quaternion
 
+from kgs._support.errors import DataError
+from kgs._support.json_files import write_json
 from kgs.app import sfm
 from kgs.app.cli.unposed import is_unposed
 from kgs.app.files.outputs import write_png
 from kgs.app.files.publishing import enter
 from kgs.datasets import synthetic_scene
 from kgs.datasets.folders import nearest_scene
-from kgs.errors import DataError
 from kgs.fit.config import COARSE, DETAILS
-from kgs.json_files import write_json
 
 SIZE = (72, 96)
 FIT = ("--steps", 6, "--init", "random", "--init-points", 200, "--preset", "plain")

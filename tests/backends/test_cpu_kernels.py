@@ -14,11 +14,11 @@ from kgs.backends.torch.binning import bin_to_tiles
 
 nb = pytest.importorskip("numba")
 
+from kgs._support.compiled.arrays import arrays  # noqa: E402  # needs numba
+from kgs._support.compiled.lanes import WIDTH, load, store  # noqa: E402  # needs numba
 from kgs.backends.cpu import binning_kernels, loss_kernels, projection_kernels  # noqa: E402  # needs numba
 from kgs.backends.cpu import compositing_kernels as kernels  # noqa: E402  # needs numba
 from kgs.backends.cpu.binning import TileCoverage  # noqa: E402  # needs numba
-from kgs.compiled.arrays import arrays  # noqa: E402  # needs numba
-from kgs.compiled.lanes import WIDTH, load, store  # noqa: E402  # needs numba
 from kgs.init_points import matching_kernels  # noqa: E402  # needs numba
 
 

@@ -7,9 +7,9 @@ import pytest
 
 nb = pytest.importorskip("numba")
 
-from kgs.compiled import lanes  # noqa: E402  # needs numba
-from kgs.compiled.kernel import exp2, f32  # noqa: E402
-from kgs.compiled.lanes import WIDTH, load, store  # noqa: E402
+from kgs._support.compiled import lanes  # noqa: E402  # needs numba
+from kgs._support.compiled.kernel import exp2, f32  # noqa: E402
+from kgs._support.compiled.lanes import WIDTH, load, store  # noqa: E402
 
 LIMIT = f32(0.5)
 ONES = {"floor": np.floor, "ceil": np.ceil, "magnitude": np.abs, "exp2": np.exp2}

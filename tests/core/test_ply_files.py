@@ -10,7 +10,7 @@ import pytest
 import torch
 from factories import random_model, splat_columns
 
-from kgs.errors import DataError
+from kgs._support.errors import DataError
 from kgs.ply import load_ply, save_ply
 
 SIZES = {"char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I", "float": "f", "double": "d"}

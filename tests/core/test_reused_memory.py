@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-import kgs.memory
-from kgs.memory import array, empty
+import kgs._support.memory
+from kgs._support.memory import array, empty
 
 LARGE = (1000, 100)
 
@@ -20,7 +20,7 @@ def place(values):
 
 @pytest.fixture(autouse=True)
 def nothing_is_free(monkeypatch):
-    monkeypatch.setattr(kgs.memory, "_free", [])
+    monkeypatch.setattr(kgs._support.memory, "_free", [])
 
 
 def test_memory_of_an_array_that_is_gone_is_used_again():
@@ -79,10 +79,10 @@ def test_tensors_are_like_the_one_that_is_given(dtype):
 
 
 def test_what_is_kept_is_bounded(monkeypatch):
-    monkeypatch.setattr(kgs.memory, "_KEPT", 2**20)
+    monkeypatch.setattr(kgs._support.memory, "_KEPT", 2**20)
     arrays = [array(LARGE) for _ in range(10)]
     del arrays
-    assert 0 < sum(map(len, kgs.memory._free)) <= 2**20
+    assert 0 < sum(map(len, kgs._support.memory._free)) <= 2**20
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
@@ -90,7 +90,7 @@ def test_a_child_forked_while_a_thread_takes_memory_can_take_some():
     taken = threading.Event()
 
     def take():
-        with kgs.memory._lock:
+        with kgs._support.memory._lock:
             taken.set()
             threading.Event().wait(0.2)
 

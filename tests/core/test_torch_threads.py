@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from kgs.torch_threads import thread_count, torch_on_all_threads, torch_on_one_thread
+from kgs._support.torch_threads import thread_count, torch_on_all_threads, torch_on_one_thread
 
 
 def test_kernels_keep_their_threads_and_torch_gets_its_own_back(set_threads):

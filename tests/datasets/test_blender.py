@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import torch
 
+from kgs._support.errors import DataError
 from kgs.datasets import load_scene
-from kgs.errors import DataError
 
 WIDTH, HEIGHT, ANGLE = 40, 30, 0.7
 

@@ -12,8 +12,8 @@ import pytest
 import torch
 from posed_scenes import COUNT, HEIGHT, WIDTH, WORLD_POINT, write_colmap
 
+from kgs._support.errors import DataError
 from kgs.datasets import load_scene
-from kgs.errors import DataError
 
 DISTORTED = [
     ("SIMPLE_RADIAL", [40.0, 24.3, 15.6, -0.1]),

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from kgs._support.errors import DataError
 from kgs.datasets.layouts.colmap_model import read_cameras, read_frames, read_images, read_points, read_rigs
-from kgs.errors import DataError
 
 CAMERA = struct.pack("<QIiQQ4d", 1, 3, 1, 8, 6, 5.0, 6.0, 4.0, 3.0)
 IMAGES = (

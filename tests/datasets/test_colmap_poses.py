@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from posed_scenes import HEIGHT, WIDTH, poses, write_photo
 
+from kgs._support.errors import DataError
 from kgs.datasets import load_scene
 from kgs.datasets.layouts.colmap_poses import registered_images
-from kgs.errors import DataError
 
 FRAMES = 4
 BOTH = pytest.mark.parametrize("text", [False, True])

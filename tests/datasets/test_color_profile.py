@@ -13,11 +13,11 @@ import pytest
 from PIL import ImageCms
 from tiny_scenes import png_chunk, write_colmap
 
+from kgs._support.errors import DataError
+from kgs._support.progress import silent
 from kgs.app.sfm.read import open_photos, read_photos
 from kgs.datasets import load_scene
 from kgs.datasets.image_file import ImageFile, color_notes, read_image
-from kgs.errors import DataError
-from kgs.progress import silent
 
 # The primaries of Display P3 adapted to D50 (SMPTE EG 432-1, Bradford), and their linear light in that of sRGB.
 P3_COLORANTS = ((0.51512, 0.24120, -0.00105), (0.29198, 0.69225, 0.04189), (0.15710, 0.06657, 0.78407))

@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 import torch
 
+from kgs._support.errors import DataError
 from kgs.datasets.frames import Frame, find_file, path_inside
 from kgs.datasets.image_file import ImageFile
 from kgs.datasets.images import Intrinsics
-from kgs.errors import DataError
 
 LENS = Intrinsics(16, 12, 14.0, 14.0, 8.0, 6.0)
 SOURCE = Path("transforms.json")

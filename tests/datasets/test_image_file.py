@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from tiny_scenes import plain_png, png_chunk, png_of
 
+from kgs._support.errors import DataError
 from kgs.datasets.image_file import read_image, read_size
-from kgs.errors import DataError
 
 
 def photo(height: int = 60, width: int = 80) -> np.ndarray:

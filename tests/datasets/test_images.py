@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
+from kgs._support.errors import DataError
 from kgs.datasets.folders import image_folder, list_images
 from kgs.datasets.image_file import read_image
 from kgs.datasets.images import Intrinsics, rectification, remap, resize
-from kgs.errors import DataError
 
 WIDTH, HEIGHT = 120, 90
 

@@ -10,8 +10,8 @@ import pytest
 import torch
 from posed_scenes import COUNT, HEIGHT, LAYOUTS, TEST, WIDTH, WORLD_POINT, moved, pixel_of, poses
 
+from kgs._support.errors import DataError
 from kgs.datasets import Scene, Views, load_scene
-from kgs.errors import DataError
 
 EACH = pytest.mark.parametrize("layout", LAYOUTS)
 

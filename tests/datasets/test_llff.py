@@ -11,8 +11,8 @@ import pytest
 import torch
 from posed_scenes import WORLD_POINT, llff_rows, poses, write_colmap, write_rows
 
+from kgs._support.errors import DataError
 from kgs.datasets import load_scene
-from kgs.errors import DataError
 from kgs.fit import FitConfig
 from kgs.fit.run import choose_points
 

@@ -12,8 +12,8 @@ import torch
 from epipolar import sampson_distances
 from tiny_scenes import write_blender, write_colmap, write_nerfstudio
 
+from kgs._support.errors import DataError
 from kgs.datasets import load_scene
-from kgs.errors import DataError
 
 # an LLFF row for 6x4 images: axes down, right, backward, the centre, (height, width, focal), then two depths
 UPRIGHT = np.array([0, 1, 0, 0, 4, 1, 0, 0, 0, 6, 0, 0, -1, 0, 5, 1, 9], dtype=float)

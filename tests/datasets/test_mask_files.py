@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
+from kgs._support.errors import DataError
 from kgs.datasets.mask_files import find_mask_files
-from kgs.errors import DataError
 
 CAMERAS = ("images/cam0/0.jpg", "images/cam1/0.jpg")
 PLAIN = ("images/IMG_0.jpg", "images/IMG_1.jpg", "images/IMG_2.jpg")

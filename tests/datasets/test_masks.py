@@ -13,11 +13,11 @@ import torch
 from init_point_scenes import painted_planes
 from tiny_scenes import write_blender, write_colmap, write_llff, write_nerfstudio
 
+from kgs._support.errors import DataError
 from kgs.datasets import load_scene
 from kgs.datasets.folders import list_images
 from kgs.datasets.mask_files import find_mask_files
 from kgs.datasets.scene import Views
-from kgs.errors import DataError
 from kgs.fit.config import FitConfig
 from kgs.fit.measures import measure
 from kgs.fit.run import fit_scene

@@ -13,9 +13,9 @@ import pytest
 from photo_folders import planes, write_photos
 from tiny_scenes import write_blender, write_colmap, write_llff, write_nerfstudio
 
+from kgs._support.errors import DataError
 from kgs.app.sfm import agree, pose_photos
 from kgs.datasets import image_file, load_scene
-from kgs.errors import DataError
 
 _watched: list[Counter[str]] = []
 

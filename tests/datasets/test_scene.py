@@ -125,7 +125,12 @@ def test_synthetic_scenes_are_float32_on_the_cpu_whatever_the_defaults():
 
 
 def check_float32(scene):
-    for part in (scene.train, scene.test, scene.train.downsample(2), *([scene.train_full_size] if scene.train_full_size else [])):
+    for part in (
+        scene.train,
+        scene.test,
+        scene.train.downsample(2),
+        *([scene.train_full_size] if scene.train_full_size else []),
+    ):
         tensors = [part.images, part.cameras.intrinsics, part.cameras.extrinsics, part.cameras.height, part.cameras.fx]
         tensors += [part.camera([0]).width] + ([] if part.masks is None else [part.masks])
         assert {(tensor.dtype, tensor.device.type) for tensor in tensors} == {(torch.float32, "cpu")}

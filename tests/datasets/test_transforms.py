@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
+from kgs._support.errors import DataError
 from kgs.datasets import load_scene
-from kgs.errors import DataError
 
 WIDTH, HEIGHT, COUNT = 40, 30, 4
 LENS: dict[str, Any] = {"fl_x": 50.0, "fl_y": 52.0, "cx": 21.0, "cy": 14.5, "w": WIDTH, "h": HEIGHT}

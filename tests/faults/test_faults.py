@@ -20,8 +20,8 @@ if sys.platform != "linux":
 
 from fits import PATIENCE, Fit, memory_of, start_command
 
+from kgs._support.errors import DataError
 from kgs.app.files.results_folder import CHECKPOINT
-from kgs.errors import DataError
 from kgs.fit.checkpoint import load_checkpoint, newest_checkpoint
 
 SHORT, LONG = 24, 450  # steps

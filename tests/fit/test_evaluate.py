@@ -10,8 +10,8 @@ import pytest
 import torch
 from factories import random_views
 
+from kgs._support.errors import DataError
 from kgs.datasets.scene import Scene
-from kgs.errors import DataError
 from kgs.metrics.evaluate import BEST, clipped_psnr, evaluate, mean_psnr, measure_again
 from kgs.metrics.lpips import Lpips
 
@@ -132,7 +132,10 @@ def test_masked_views_without_gains_are_recoloured_for_a_render_that_takes_a_cam
     assert evaluate(render, masked, correct_color=True) == evaluate(render, views, correct_color=True)
     none = torch.zeros(0, 3)
     scene = Scene(masked, masked, none, none, "none", torch.zeros(3), torch.zeros(3), Path("scene"))
-    metrics = {part: evaluate(render, masked, correct_color=part == "color_corrected") for part in ("test", "train", "color_corrected")}
+    metrics = {
+        part: evaluate(render, masked, correct_color=part == "color_corrected")
+        for part in ("test", "train", "color_corrected")
+    }
     assert measure_again(Path("metrics.json"), metrics, scene, render, None) == metrics
 
 

@@ -227,7 +227,9 @@ def test_a_background_that_shows_through_is_not_exposed_in_the_curve_and_in_pict
     assert clipped_psnr(trainer.state.curve[0]["train_psnr"]) > 80
     assert trainer.state.curve[0]["test_psnr"] < 40
     for view, target in enumerate(targets(scene.train, scene.background, torch.device("cpu"))):
-        own = GaussianRenderer()(see_through.model(), target.camera, target.background_before_gain(scene.background)).image
+        own = GaussianRenderer()(
+            see_through.model(), target.camera, target.background_before_gain(scene.background)
+        ).image
         seen = scene.train.as_photo(view, scene.train.render(view, see_through.render))
         torch.testing.assert_close(seen, target.as_photographed(own).detach(), atol=1e-6, rtol=0)
     with_metrics = replace(see_through, metrics=measure(see_through))

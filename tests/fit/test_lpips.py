@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from kgs.errors import DataError
+from kgs._support.errors import DataError
 from kgs.metrics.lpips import Lpips
 
 VGG16 = {0: (64, 3), 2: (64, 64), 5: (128, 64), 7: (128, 128), 10: (256, 128), 12: (256, 256), 14: (256, 256)}

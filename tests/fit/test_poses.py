@@ -10,13 +10,13 @@ import torch
 from kornia.geometry.liegroup import Se3
 from tiny_scenes import write_llff
 
+from kgs._support.errors import DataError
 from kgs.app.cli.evaluate import evaluate
 from kgs.app.files.results_folder import CHECKPOINT
 from kgs.app.fit_folder import fit_folder
 from kgs.app.saved_fit import load_fit
 from kgs.app.scene_request import SceneRequest
 from kgs.datasets import load_scene, synthetic_scene
-from kgs.errors import DataError
 from kgs.fit import FitConfig, Trainer
 from kgs.fit.checkpoint import load_checkpoint, save_checkpoint
 from kgs.fit.plan import make_plan

@@ -11,11 +11,11 @@ from typing import Any
 
 import pytest
 
+from kgs._support.errors import DataError
 from kgs.app import fit_folder as app
 from kgs.app.files.results_folder import CHECKPOINT
 from kgs.app.fit_folder import Published, train
 from kgs.app.scene_request import SceneRequest
-from kgs.errors import DataError
 from kgs.fit.checkpoint import load_checkpoint, previous
 from kgs.fit.config import FitConfig, Recipe
 from kgs.fit.plan import make_plan

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
+from kgs._support.errors import DataError
 from kgs.app.saved_fit import read_settings
 from kgs.app.scene_request import SceneRequest
-from kgs.errors import DataError
 from kgs.fit.config import DETAILS, FitConfig
 
 REQUEST = SceneRequest("/photos", train_views=3, downscale=2.0, roll=-90.0, photos=False, title="mine")

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
-from kgs.errors import DataError
+from kgs._support.errors import DataError
 
 _SLOWEST, _MEMORY_FACTOR, _MEMORY = 1.0, 4, 64 * 2**20
 

@@ -85,7 +85,9 @@ def _read_image(folder: Path, suffix: str) -> None:
 
 def _read_ply(folder: Path) -> None:
     for name, value in load_ply(folder / "splat.ply").state_dict().items():
-        minimum = -math.inf if name in ("log_scales", "opacity_logits") else -3.5e38  # of a flat disc, of an opacity of 0
+        minimum = (
+            -math.inf if name in ("log_scales", "opacity_logits") else -3.5e38
+        )  # of a flat disc, of an opacity of 0
         maximum = math.inf if name == "opacity_logits" else 3.5e38
         check_range(name, value, minimum, maximum)
 

@@ -16,9 +16,9 @@ from cost import read_within_bounds
 from damage import GEOMETRIC_KEYS
 from tiny_scenes import plain_png, write_blender, write_image, write_nerfstudio
 
+from kgs._support.errors import DataError
 from kgs.datasets import Views, load_scene
 from kgs.datasets.image_file import read_image
-from kgs.errors import DataError
 from kgs.init_points.files import read_points
 
 SIDE = 8000

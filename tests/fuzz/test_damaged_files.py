@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from readers import READERS, Reader
 
-from kgs.errors import DataError
+from kgs._support.errors import DataError
 
 
 @pytest.fixture(scope="module")

@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 import torch
 
+from kgs._support.json_files import write_json
 from kgs.fit.config import FitConfig
-from kgs.json_files import write_json
 from kgs.metrics import lpips
 from kgs.metrics.lpips import Lpips
 from kgs.model import GaussianModel

@@ -240,7 +240,9 @@ def test_the_first_of_each_cell_is_that_of_numpy() -> None:
 
 @pytest.mark.slow
 def test_a_draw_of_more_than_there_is_takes_all(views: Views, span: tuple[float, float]) -> None:
-    every = [dense_points(views.downsample(2), *span, 10**6, generator(), draw=draw)[0] for draw in ("spread", "uniform")]
+    every = [
+        dense_points(views.downsample(2), *span, 10**6, generator(), draw=draw)[0] for draw in ("spread", "uniform")
+    ]
     assert len(every[0]) == len(every[1])
     assert torch.equal(every[0].sort(0).values, every[1].sort(0).values)
 

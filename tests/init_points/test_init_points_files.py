@@ -14,10 +14,10 @@ from factories import with_camera
 from init_point_scenes import flat
 
 import kgs
+from kgs._support.errors import DataError
 from kgs.app.fit_folder import fit_folder
 from kgs.app.scene_request import SceneRequest
 from kgs.datasets import Scene
-from kgs.errors import DataError
 from kgs.fit import FitConfig
 from kgs.fit.run import choose_points
 from kgs.init_points import initial_points

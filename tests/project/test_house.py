@@ -15,16 +15,16 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PACKAGES = {"kgs": "kgs", "losses": "kgs.losses", "datasets": "kgs.datasets"}  # folder, and the name it is installed by
 PUBLIC = ("kgs", "kgs.losses", "kgs.datasets", "kgs.reference", "kgs.fit")
-GROUND = {"core", "backends", "compiled"}  # what stands in kgs itself is the core
+GROUND = {"core", "backends", "_support"}  # what stands in kgs itself is the core
 LIBRARY = {*GROUND, "gsplat", "losses", "datasets", "metrics", "init_points", "fit", "bench"}
 MAY_IMPORT = {  # a room, and the others that it may import
-    "kgs": {"core", "gsplat"},  # the face, which names what is elsewhere
-    "core": {"backends"},
-    "compiled": set(),
+    "kgs": {"core", "gsplat", "_support"},  # the face, which names what is elsewhere
+    "core": {"backends", "_support"},
+    "_support": set(),
     "backends": GROUND,
     "gsplat": GROUND,
-    "losses": {"backends"},
-    "datasets": {"core"},
+    "losses": {"backends", "_support"},
+    "datasets": {"core", "_support"},
     "metrics": GROUND | {"datasets"},
     "init_points": GROUND | {"datasets"},
     "fit": GROUND | {"losses", "datasets", "metrics", "init_points"},
@@ -32,7 +32,7 @@ MAY_IMPORT = {  # a room, and the others that it may import
     "app": LIBRARY,  # which prints, locks and publishes: no other room but the study knows it
     "study": LIBRARY | {"app"},  # which no other room knows
 }
-BELOW_SCENES = {"kgs.errors", "kgs.json_files", "kgs.geometry", "kgs.lazy"}  # the core that datasets may import
+BELOW_SCENES = {"kgs.geometry"}  # the core that datasets may import
 HEAVY = ("cv2", "PIL", "trimesh", "matplotlib", "tqdm", "tyro", "numba", "pycolmap", "pandas", "scipy", "distributed")
 
 
@@ -134,12 +134,12 @@ before = set(sys.modules)
 kgs.GaussianRenderer
 print(*sorted(set(sys.modules) - before))
 sys.modules["resource"] = None
-import kgs.fit.run, kgs.machine, kgs.datasets.load
+import kgs.fit.run, kgs._support.machine, kgs.datasets.load
 print("slow:", *{"scipy.spatial", "networkx", "trimesh", "matplotlib", "torch._dynamo"} & set(sys.modules))
 from pathlib import Path
 exists = Path.exists
 Path.exists = lambda path: False if str(path).startswith("/proc") else exists(path)
-print(kgs.machine.peak_rss_mb())
+print(kgs._support.machine.peak_rss_mb())
 """
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     at_first, by_the_renderer, by_a_fit, memory = done.stdout.splitlines()
@@ -158,7 +158,9 @@ print(kgs.machine.peak_rss_mb())
 
 @pytest.mark.parametrize("name", SOURCES)
 def test_every_module_says_what_it_is_and_exports_what_it_has(name):
-    if within(name, "kgs.backends.cpu", "kgs.compiled.kernel", "kgs.compiled.lanes") or name.endswith("_kernels"):
+    if within(name, "kgs.backends.cpu", "kgs._support.compiled.kernel", "kgs._support.compiled.lanes") or name.endswith(
+        "_kernels"
+    ):
         pytest.importorskip("numba")
     module = importlib.import_module(name)
     assert module.__doc__

@@ -113,7 +113,9 @@ def test_real_scenes_are_trained_from_the_middle_and_tested_outside(tmp_path):
     extrinsics[:, 0, 3] = -places
     views = as_views(pinholes(torch.eye(4).repeat(8, 1, 1), extrinsics, (2, 3)), torch.rand(8, 3, 2, 3))
     none = torch.zeros(0, 3)
-    whole = Scene(views, views.select([]), none, none, "none", torch.zeros(3), torch.zeros(3), tmp_path, train_full_size=views)
+    whole = Scene(
+        views, views.select([]), none, none, "none", torch.zeros(3), torch.zeros(3), tmp_path, train_full_size=views
+    )
     scene = from_the_middle(whole, 3)
     assert scene.train.names == ("1.png", "2.png", "7.png")
     assert scene.train_full_size is not None

@@ -11,13 +11,13 @@ import pandas as pd
 import torch
 import tyro
 
+from kgs._support.errors import DataError
 from kgs.app.files.outputs import write_png
 from kgs.app.sfm import pose_photos
 from kgs.app.sfm.map import quiet_pycolmap
 from kgs.bench.output import markdown_table
 from kgs.datasets import load_scene
 from kgs.datasets.synthetic import synthetic_views
-from kgs.errors import DataError
 from kgs.geometry import camera_centers, degrees_between
 from kgs.study.grid import Cell, run_grid
 from kgs.study.pairs import grouped

@@ -12,11 +12,11 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
+from kgs._support.errors import DataError
 from kgs.app.sfm import pose_photos
 from kgs.app.sfm.find import find_photos
 from kgs.bench.output import markdown_table
 from kgs.datasets import load_scene
-from kgs.errors import DataError
 from kgs.study.grid import Cell, read_rows, run_grid
 
 FOLDERS = {  # by the name of a set: where its photos are in SCENES, and where their given poses

@@ -11,11 +11,11 @@ from typing import Any
 
 import torch
 
+from kgs._support.machine import versions
 from kgs.bench.output import markdown_table
 from kgs.bench.speed import SIZE, Cases
 from kgs.bench.timing import Case, take_turns
 from kgs.gsplat import rasterization
-from kgs.machine import versions
 
 COUNTS = (10_000, 50_000)
 OPTIONS: dict[str, dict[str, Any]] = {

@@ -10,9 +10,9 @@ from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 
+from kgs._support.errors import DataError
 from kgs.datasets import folders
 from kgs.datasets.options import held_out_between_ends
-from kgs.errors import DataError
 
 SMALLEST = 32  # pixels of the longer side of a fit's photos
 _ALWAYS = ("torch", "kornia", "numpy", "cv2", "PIL")
@@ -82,8 +82,8 @@ def check_scene(scene: Path) -> None:
 
 def check_results(out: Path) -> None:
     """Raise a DataError unless this is the folder of the results of a fit."""
+    from kgs._support.json_files import read_json
     from kgs.app.files.publishing import complete, unpublished
-    from kgs.json_files import read_json
 
     complete(out)
     config = out / "config.json"

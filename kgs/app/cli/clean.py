@@ -4,11 +4,11 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from kgs._support.errors import DataError, printable
 from kgs.app.console import VIEWER, as_line, each, say, say_next
-from kgs.errors import DataError, printable
 from kgs.fit.config import Backend, Background
 
-from .inputs import load_cameras, load_splat
+from .inputs import check_tools, load_cameras, load_splat
 from .options import Existing, Out
 
 if TYPE_CHECKING:
@@ -56,7 +56,6 @@ def clean(
     from kgs.app.saved_fit import load_fit
     from kgs.fit.clean import check_left, check_strength, find_strays
     from kgs.fit.clean import clean as clean_fit
-    from kgs.machine import check_tools
     from kgs.ply import save_ply
 
     check_strength(strength)

@@ -5,10 +5,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from kgs._support.errors import DataError, printable
 from kgs.app.console import VIEWER, as_line, each, say, say_next
-from kgs.errors import DataError, printable
 from kgs.fit.config import DEMO, DEMO_STEPS, DROP, Backend, FitConfig
 
+from .inputs import check_tools
 from .options import Out
 
 if TYPE_CHECKING:
@@ -45,7 +46,6 @@ def demo(
     """
     from kgs.app.files.outputs import check_folder
     from kgs.datasets import synthetic_scene
-    from kgs.machine import check_tools
 
     config = replace(DEMO, seed=seed, steps=steps, device=device, backend=backend)
     check_tools(device, backend, "jinja2")
@@ -73,6 +73,7 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, floa
 
     `drops` are the rates of dropping by the name of the run; pictures show the last one beside the others.
     """
+    from kgs._support.json_files import write_json
     from kgs.app.files.exports import write_exports
     from kgs.app.files.figures import write_curve, write_sheet
     from kgs.app.files.publishing import replacing
@@ -82,7 +83,6 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, floa
     from kgs.fit.plan import make_plan
     from kgs.fit.run import choose_points
     from kgs.fit.trainer import Trainer
-    from kgs.json_files import write_json
     from kgs.ply import save_ply
 
     points = choose_points(scene, config, each)

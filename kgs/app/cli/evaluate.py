@@ -4,10 +4,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from kgs._support.errors import DataError, printable
 from kgs.app.console import as_line, say, say_next
-from kgs.errors import DataError, printable
 from kgs.fit.config import Backend
 
+from .inputs import check_tools
 from .options import Existing
 
 
@@ -28,12 +29,11 @@ def evaluate(
         device: cpu, cuda, ...
         backend: auto: that of the fit. kgs fit --help-all describes the others.
     """
+    from kgs._support.json_files import read_json, write_json
     from kgs.app.files.locks import locked
     from kgs.app.files.publishing import replacing
     from kgs.app.page.fit_page import PAGE, write_own_page
     from kgs.app.saved_fit import load_fit
-    from kgs.json_files import read_json, write_json
-    from kgs.machine import check_tools
     from kgs.metrics.evaluate import as_text, measure_again
     from kgs.metrics.lpips import Lpips
 

@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Any
 
+from kgs._support.errors import printable
 from kgs.app.console import VIEWER, as_line, say, say_next
-from kgs.errors import printable
 
 from .options import Existing, Out
 
@@ -33,9 +33,9 @@ def export(
     """
     import torch
 
+    from kgs._support.errors import DataError
     from kgs.app.files.publishing import replacing
     from kgs.compressed_ply import save_compressed_ply
-    from kgs.errors import DataError
     from kgs.ply import load_ply
 
     model = load_ply(ply, torch.tensor(origin, dtype=torch.float64))

@@ -10,10 +10,11 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from kgs._support.errors import DataError, printable
 from kgs.app.console import VIEWER, as_line, say, say_next
-from kgs.errors import DataError, printable
 from kgs.fit.config import COARSE, DETAILS, PRESETS, Background, FitConfig, min_side
 
+from .inputs import check_tools
 from .options import Existing, Out, options_in
 
 
@@ -101,7 +102,6 @@ def fit(
     from kgs.datasets.folders import CAMERAS_REPORT
     from kgs.fit.prune import left_out
     from kgs.init_points.files import read_points
-    from kgs.machine import check_tools
     from kgs.metrics.evaluate import as_text
     from kgs.metrics.lpips import Lpips
 
@@ -175,7 +175,9 @@ def fit(
         say_next("the same command with --resume goes on where it stopped")
         return 128 + published.signal
     full_side = request.full_side(loaded) if is_free and preset == "auto" else None
-    more = f"the same command with --detail high fits {full_side} pixels instead of {max(height, width)}, and takes longer"
+    more = (
+        f"the same command with --detail high fits {full_side} pixels instead of {max(height, width)}, and takes longer"
+    )
     say_next(
         f"open {as_line(out / 'index.html')} in a browser: the splat to look around in, and how good it is",
         *([more] if full_side else []),

@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from kgs._support.errors import DataError, listed, printable
 from kgs.app.console import say
-from kgs.errors import DataError, listed, printable
 from kgs.fit.config import Recipe
 
 if TYPE_CHECKING:
@@ -12,6 +12,17 @@ if TYPE_CHECKING:
 
     from kgs.datasets.scene import Scene
     from kgs.fit.fit import Fit
+
+
+def check_tools(device: str, backend: str, *packages: str) -> "torch.device":
+    """The device; raises if it, the backend or a package that a command needs is missing."""
+    from kgs._support.machine import check_device, check_packages
+    from kgs.backends import resolve
+
+    found = check_device(device)
+    resolve(backend, found)
+    check_packages(*packages)
+    return found
 
 
 def load_cameras(cameras: Path, downscale: float | None, photos: bool = False, **options: Any) -> "Scene":

@@ -4,11 +4,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from kgs._support.errors import printable
 from kgs.app.console import as_line, say, say_next
-from kgs.errors import printable
 from kgs.fit.config import Backend, Background
 
-from .inputs import load_cameras, load_splat
+from .inputs import check_tools, load_cameras, load_splat
 from .options import Existing, Out
 
 if TYPE_CHECKING:
@@ -46,11 +46,11 @@ def page(
         device: cpu, cuda, ...
         backend: auto: the fastest that is installed. kgs fit --help-all describes the others.
     """
+    from kgs._support.machine import versions
     from kgs.app.files.publishing import replacing
     from kgs.app.page.fit_page import MAX_PICTURES, load_small, spread, write_fit_page
     from kgs.datasets import load_scene
     from kgs.losses.photometric import WINDOW
-    from kgs.machine import check_tools, versions
     from kgs.metrics.evaluate import evaluate
 
     place = check_tools(device, backend, "jinja2")

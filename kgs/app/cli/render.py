@@ -3,11 +3,11 @@
 from pathlib import Path
 from typing import Any, Literal
 
+from kgs._support.errors import printable
 from kgs.app.console import VIEWER, as_line, each, say, say_next
-from kgs.errors import printable
 from kgs.fit.config import Backend, Background
 
-from .inputs import load_cameras, load_splat
+from .inputs import check_tools, load_cameras, load_splat
 from .options import Existing, Out
 
 
@@ -45,7 +45,6 @@ def render(
     from kgs.app.files.outputs import check_folder, png_names, write_png
     from kgs.app.files.publishing import replacing
     from kgs.camera import move_camera
-    from kgs.machine import check_tools
     from kgs.renderer import GaussianRenderer
 
     place = check_tools(device, backend)

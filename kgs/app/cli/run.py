@@ -14,8 +14,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, get_args
 
+from kgs._support.errors import DataError, TrainingDiverged, printable
 from kgs.app.console import as_line, say
-from kgs.errors import DataError, TrainingDiverged, printable
 from kgs.fit.config import FitConfig, Recipe
 
 from .interrupts import interrupt_as_usual
@@ -179,7 +179,7 @@ def _find(words: list[str]) -> tuple[str, list[str]]:
 
 
 def _say_versions() -> None:
-    from kgs.machine import versions
+    from kgs._support.machine import versions
 
     lines = {"numba": "is not installed: the extra fast brings it", **versions()}
     say("\n".join(f"{name} {version}" for name, version in lines.items()))

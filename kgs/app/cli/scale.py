@@ -4,8 +4,8 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from kgs._support.errors import DataError, printable
 from kgs.app.console import as_line, say, say_next
-from kgs.errors import DataError, printable
 
 from .options import Existing, Out
 
@@ -43,13 +43,13 @@ def scale(splat: Existing, /, *, by: tuple[str, str, float], out: Out) -> None:
 
 def _scale_folder(folder: Path, out: Path, factor: float, length: float) -> None:
     """Write the files of a fit in the new unit; the fit stays as it is."""
+    from kgs._support.machine import check_packages
     from kgs.app.files.exports import write_splat_exports
     from kgs.app.files.outputs import check_folder
     from kgs.app.files.publishing import replacing
     from kgs.app.page.fit_page import write_own_page
     from kgs.app.saved_fit import load_fit
     from kgs.fit.scale import scaled
-    from kgs.machine import check_packages
     from kgs.ply import save_ply
 
     check_packages("jinja2")

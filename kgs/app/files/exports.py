@@ -6,6 +6,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from kgs._support.json_files import write_json
 from kgs.app.console import each
 from kgs.app.files.cameras import camera_list, rolled, shown, upright
 from kgs.app.files.encoders import film_suffix
@@ -16,7 +17,6 @@ from kgs.compressed_ply import save_compressed_ply
 from kgs.datasets.scene import pinholes
 from kgs.fit.fit import Fit
 from kgs.geometry import typical_depths
-from kgs.json_files import write_json
 from kgs.ply import float32_moves
 
 

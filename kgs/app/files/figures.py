@@ -9,8 +9,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
+from kgs._support.json_files import write_whole
 from kgs.datasets.scene import Views
-from kgs.json_files import write_whole
 
 from .images import eight_bits
 from .plot import psnr_plot

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from kgs._support.progress import ProgressBar, silent
 from kgs.datasets.scene import Views, pinholes
 from kgs.geometry import camera_centers, meeting_point, typical_depths
-from kgs.progress import ProgressBar, silent
 
 from .cameras import upright
 from .encoders import encode
@@ -49,7 +49,7 @@ def write_film(
         render: from a camera to an image `(1, 3, H, W)`.
         views: the views whose cameras the path passes.
         depth: distance from the cameras to the scene, in world units.
-        bar: wraps the loops to show their progress, see :mod:`kgs.progress`.
+        bar: wraps the loops to show their progress, see :mod:`kgs._support.progress`.
 
     Returns:
         "", or the reason why no film was written: there is no encoder for it here.

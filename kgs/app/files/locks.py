@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from kgs.errors import DataError
+from kgs._support.errors import DataError
 
 
 @contextmanager

@@ -9,9 +9,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from kgs._support.errors import DataError
+from kgs._support.json_files import write_whole
 from kgs.datasets.folders import CAMERAS_REPORT, LAYOUT_FILES, list_images
-from kgs.errors import DataError
-from kgs.json_files import write_whole
 
 from .publishing import is_own
 

@@ -7,9 +7,9 @@ import cv2
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from kgs._support.json_files import write_whole
 from kgs.datasets.scene import Views, pinholes
 from kgs.geometry import camera_centers
-from kgs.json_files import write_whole
 
 from .images import eight_bits
 

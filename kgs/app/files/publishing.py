@@ -17,9 +17,9 @@ from itertools import chain, count
 from pathlib import Path, PurePath
 from typing import Any
 
+from kgs._support.errors import DataError, listed, printable
+from kgs._support.json_files import read_json, write_json
 from kgs.app.console import say
-from kgs.errors import DataError, listed, printable
-from kgs.json_files import read_json, write_json
 
 from .locks import held
 

@@ -4,8 +4,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from kgs.errors import DataError
-from kgs.json_files import read_json
+from kgs._support.errors import DataError
+from kgs._support.json_files import read_json
 
 from .publishing import discard, unpublished
 

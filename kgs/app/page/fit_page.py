@@ -12,6 +12,8 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from kgs._support.errors import DataError
+from kgs._support.json_files import read_json
 from kgs.app.console import each
 from kgs.app.files.cameras import shown
 from kgs.app.scene_request import SceneRequest
@@ -19,11 +21,9 @@ from kgs.datasets.folders import CAMERAS_REPORT
 from kgs.datasets.load import load_scene
 from kgs.datasets.scene import Scene, Views
 from kgs.datasets.splits import select_evenly
-from kgs.errors import DataError
 from kgs.fit.fit import Fit
 from kgs.fit.measures import used_init
 from kgs.fit.prune import contributions, left_out
-from kgs.json_files import read_json
 from kgs.types import Gaussians
 
 from .content import PageContent, PagePhotos, PageSplat, PageText

@@ -6,7 +6,7 @@ have to agree, and gates refuse cameras that cannot be trusted: see :mod:`kgs.ap
 
 from typing import TYPE_CHECKING
 
-from kgs.lazy import lazy_names
+from kgs._support.lazy import lazy_names
 
 if TYPE_CHECKING:
     from .pose import pose_photos

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from kgs.errors import DataError
-from kgs.progress import ProgressBar
+from kgs._support.errors import DataError
+from kgs._support.progress import ProgressBar
 
 from .gates import Pairs, focal_difference, focal_doubt, is_forward, judge, why_no_cameras
 from .leave_out import doubtful, without_cameras, without_overlap
@@ -52,7 +52,7 @@ def agreed_cameras(
         work: a folder for what the solvers write.
         names: the names of the photos by those of the PNGs, in the order of `photos`.
         seed: of the solvers.
-        bar: wraps the loops to show their progress, see :mod:`kgs.progress`.
+        bar: wraps the loops to show their progress, see :mod:`kgs._support.progress`.
         lap: called with the name of each part at its end.
         say: called with each line for the user.
 

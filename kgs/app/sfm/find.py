@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from kgs._support.errors import DataError, listed
 from kgs.app.files.publishing import read_marker
 from kgs.datasets import folders
 from kgs.datasets.folders import (
@@ -18,7 +19,6 @@ from kgs.datasets.folders import (
     mask_folders,
 )
 from kgs.datasets.mask_files import find_mask_files
-from kgs.errors import DataError, listed
 
 MIN_PHOTOS = 3
 MAX_FRAMES = 36  # of a video, where twelve would be too far apart

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import torch
 
-from kgs.errors import DataError
+from kgs._support.errors import DataError
 from kgs.geometry import degrees_between
 
 from .map import MIN_MATCHES, Cameras, PairGeometry

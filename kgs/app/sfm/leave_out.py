@@ -9,7 +9,7 @@ place it, it has to see enough points, and both have to agree about it and its l
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 
-from kgs.errors import DataError
+from kgs._support.errors import DataError
 
 from .find import MIN_PHOTOS, listed_files
 from .gates import MAX_DEGREES, MAX_RATIO, MIN_POINTS, SAME_PLACE, Pairs, angle_between, gap, groups_of, matches_of

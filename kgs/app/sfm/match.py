@@ -12,8 +12,8 @@ import torch
 from kornia.feature import laf_from_center_scale_ori, match_adalam
 from torch import Tensor
 
+from kgs._support.progress import ProgressBar
 from kgs.init_points.keypoints import root_sift
-from kgs.progress import ProgressBar
 
 from .read import Photo
 
@@ -53,7 +53,7 @@ def write_matches(database: Path, photos: list[Photo], names: list[str], bar: Pr
         database: the file to write.
         photos: the photos, all of one size.
         names: their names in the database.
-        bar: wraps the loops to show their progress, see :mod:`kgs.progress`.
+        bar: wraps the loops to show their progress, see :mod:`kgs._support.progress`.
     """
     # The cost of matching grows with the squares of both counts, so many photos get fewer keypoints each.
     max_count = min(MAX_KEYPOINTS, max(MIN_KEYPOINTS, ALL_KEYPOINTS // len(photos)))

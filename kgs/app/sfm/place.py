@@ -3,10 +3,10 @@
 from pathlib import Path
 from typing import Any
 
+from kgs._support.errors import DataError
+from kgs._support.json_files import read_json
 from kgs.app.files.outputs import check_folder
 from kgs.datasets.folders import CAMERAS_REPORT, list_images
-from kgs.errors import DataError
-from kgs.json_files import read_json
 
 REPORT = CAMERAS_REPORT
 IMAGES = "images"

@@ -14,16 +14,16 @@ from typing import Any
 import cv2
 import torch
 
+from kgs._support.errors import DataError, printable
+from kgs._support.json_files import read_json, write_json
+from kgs._support.machine import versions
+from kgs._support.progress import ProgressBar, silent
 from kgs.app.console import say
 from kgs.app.files.locks import locked
 from kgs.app.files.outputs import png_names
 from kgs.app.files.publishing import begin, complete, discard, publish, replacing, unpublished
 from kgs.app.files.results_folder import resumable_fits
 from kgs.datasets.image_file import color_notes
-from kgs.errors import DataError, printable
-from kgs.json_files import read_json, write_json
-from kgs.machine import versions
-from kgs.progress import ProgressBar, silent
 
 from .agree import agreed_cameras, say_left_out
 from .find import find_photos, find_video
@@ -74,7 +74,7 @@ def pose_photos(
         frames: the number of frames that are taken from a video; see :func:`kgs.app.sfm.video.take_frames`.
         wait: leave new files in a folder of their own in `out` if `out` holds a fit, which belongs to the former
             cameras.
-        bar: wraps the loops to show their progress, see :mod:`kgs.progress`.
+        bar: wraps the loops to show their progress, see :mod:`kgs._support.progress`.
         say: called with each line for the user.
 
     Returns:

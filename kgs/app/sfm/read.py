@@ -16,13 +16,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kgs._support.errors import DataError
+from kgs._support.progress import ProgressBar
 from kgs.datasets import folders, image_file
 from kgs.datasets.image_file import Image, ImageFile, turn
 from kgs.datasets.images import Intrinsics, reduce
 from kgs.datasets.mask_files import find_mask_files
 from kgs.datasets.masks import Mask, as_masks
-from kgs.errors import DataError
-from kgs.progress import ProgressBar
 
 from .find import CONVERT
 

@@ -21,10 +21,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from kgs._support.errors import DataError
+from kgs._support.progress import ProgressBar
 from kgs.app.files.encoders import NOT_UTF8, for_opencv
 from kgs.app.files.outputs import write_png
-from kgs.errors import DataError
-from kgs.progress import ProgressBar
 
 from .find import MAX_FRAMES, MIN_PHOTOS
 from .match import DEFAULT_FOCAL
@@ -62,7 +62,7 @@ def take_frames(
         folder: an empty folder.
         count: the number of frames; None: twelve, fewer where neighbours would be less than 3 degrees apart, and up to
             36 where they would be more than 10 apart.
-        bar: wraps the loops to show their progress, see :mod:`kgs.progress`.
+        bar: wraps the loops to show their progress, see :mod:`kgs._support.progress`.
         say: called with a line about the frames.
 
     Raises:

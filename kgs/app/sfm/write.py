@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from kgs._support.errors import DataError
 from kgs.app.files.outputs import write_png
 from kgs.datasets.layouts.colmap_model import read_cameras, read_images, read_points
-from kgs.errors import DataError
 
 from .map import Cameras, cameras_of, quiet_pycolmap
 from .pycolmap_processes import check_space

@@ -7,7 +7,7 @@ used.
 
 Rules that keep the kernels fast. Breaking any of them cost a measured factor of 1.5 to 3, without any warning:
 
-1. Pixels of a tile are the lanes of SIMD: kernels that loop over pixels of tiles use the `Lanes` of `kgs.compiled`, and
+1. Pixels of a tile are the lanes of SIMD: kernels that loop over pixels of tiles use the `Lanes` of `kgs._support.compiled`, and
    what runs from layer to layer stays in them. Other loops, over columns, read and write arrays at constant distances;
    otherwise LLVM finds dependences and the loop stays scalar.
 2. An index of an array must be provably >= 0, because indices wrap: a loop that counts down masks its index.
@@ -16,7 +16,7 @@ Rules that keep the kernels fast. Breaking any of them cost a measured factor of
 5. Reads may miss the caches, writes may not: gathers are loops of their own, and sums by Gaussian are kept for a band
    of neighbouring tiles.
 6. The number of features is a constant of the compiled kernel: the length of a tuple.
-7. What a step needs comes from `kgs.memory`, which uses memory again and begins at a cache line.
+7. What a step needs comes from `kgs._support.memory`, which uses memory again and begins at a cache line.
 8. Ranges and bands do not depend on the number of threads, and nothing is summed by two threads: same bits on any
    number of them.
 """

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kgs.compiled.lanes import WIDTH
-from kgs.memory import array
+from kgs._support.compiled.lanes import WIDTH
+from kgs._support.memory import array
 
 from .binning_kernels import (
     SIZE,

@@ -11,8 +11,8 @@ import math
 
 import numpy as np
 
-from kgs.compiled.kernel import ONE, TWO, ZERO, f32, inline, is_finite, jit
-from kgs.compiled.lanes import WIDTH, load, store
+from kgs._support.compiled.kernel import ONE, TWO, ZERO, f32, inline, is_finite, jit
+from kgs._support.compiled.lanes import WIDTH, load, store
 
 SIZE = 8  # side of a tile; a constant, so that loops over pixels have a constant length
 _BITS, _BUCKETS = 11, 2048

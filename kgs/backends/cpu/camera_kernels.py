@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from kgs.compiled.kernel import ONE, ZERO, jit
+from kgs._support.compiled.kernel import ONE, ZERO, jit
 
 from .projection_kernels import camera_point, color_gradients, point_gradient, rotation, rows, turned_back
 

@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kgs._support.compiled.arrays import arrays
+from kgs._support.compiled.threads import parallel_for
+from kgs._support.memory import array, empty
+from kgs._support.torch_threads import thread_count
 from kgs.backends.base import CompositingCall, CompositingInputs, Compositor, Images
 from kgs.backends.row_slices import row_slices
-from kgs.compiled.arrays import arrays
-from kgs.compiled.threads import parallel_for
-from kgs.memory import array, empty
-from kgs.torch_threads import thread_count
 
 from . import compositing_kernels as kernels
 from .binning import Band, RowSlice, TileCoverage, table_width

@@ -26,8 +26,8 @@ import math
 
 import numpy as np
 
-from kgs.compiled.kernel import HALF, ONE, ZERO, exp2, f32, inline, is_finite, jit, scratch
-from kgs.compiled.lanes import (
+from kgs._support.compiled.kernel import HALF, ONE, ZERO, exp2, f32, inline, is_finite, jit, scratch
+from kgs._support.compiled.lanes import (
     WIDTH,
     bits_above,
     columns,

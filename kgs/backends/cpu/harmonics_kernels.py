@@ -1,6 +1,6 @@
 """Spherical harmonics up to degree 3 at one direction: basis, colour and derivative; formulas as in `kgs.harmonics`."""
 
-from kgs.compiled.kernel import HALF, TWO, ZERO, f32, inline
+from kgs._support.compiled.kernel import HALF, TWO, ZERO, f32, inline
 
 THREE, FOUR, SIX, EIGHT = f32(3.0), f32(4.0), f32(6.0), f32(8.0)
 BAND_0, _B = f32(0.28209479177387814), f32(0.4886025119029199)

@@ -4,10 +4,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kgs.compiled.arrays import Array, arrays
-from kgs.compiled.threads import parallel_for
-from kgs.memory import array, empty
-from kgs.torch_threads import thread_count
+from kgs._support.compiled.arrays import Array, arrays
+from kgs._support.compiled.threads import parallel_for
+from kgs._support.memory import array, empty
+from kgs._support.torch_threads import thread_count
 
 from .loss_kernels import BAND, RADIUS, fill_moments, ssim_gradient, ssim_maps, total_gradient
 

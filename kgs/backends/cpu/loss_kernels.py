@@ -14,7 +14,7 @@ Ranges are of bands of rows, or of rows, of all channels.
 
 import numpy as np
 
-from kgs.compiled.kernel import ONE, TWO, ZERO, f32, inline, jit, scratch
+from kgs._support.compiled.kernel import ONE, TWO, ZERO, f32, inline, jit, scratch
 
 RADIUS, BAND = 5, 32  # of the window; rows of a band
 C1, C2, EPS = f32(0.01**2), f32(0.03**2), f32(1e-12)

@@ -9,13 +9,13 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from kgs._support.compiled.arrays import Array, arrays
+from kgs._support.compiled.threads import parallel_for
+from kgs._support.memory import array, empty
+from kgs._support.torch_threads import thread_count
 from kgs.backends.torch.projection import project as project_in_torch
 from kgs.camera import MARGIN, Cameras, Frame, whole_frame
-from kgs.compiled.arrays import Array, arrays
-from kgs.compiled.threads import parallel_for
-from kgs.memory import array, empty
 from kgs.projection import finite_gaussians, visibility_cutoff
-from kgs.torch_threads import thread_count
 from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
 
 from .camera_kernels import camera_gradients

@@ -22,8 +22,8 @@ import os
 
 import torch
 
+from kgs._support.errors import warn
 from kgs.backends.base import Backend, CompositingCall, Compositor, LossStage, ProjectionStage
-from kgs.errors import warn
 
 
 class GpuBackend(Backend):

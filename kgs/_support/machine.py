@@ -13,7 +13,6 @@ import cv2
 import kornia
 import torch
 
-from .backends import resolve
 from .version import __version__
 
 
@@ -26,14 +25,6 @@ def check_device(name: str) -> torch.device:
         reason = str(error).partition(". ")[0].splitlines()[0]
         raise ValueError(f"device: expected cpu or a GPU of this machine, got {name!r} ({reason:.120})") from error
     return device
-
-
-def check_tools(device: str, backend: str, *packages: str) -> torch.device:
-    """The device; raises if it, the backend or a package that a command needs is missing."""
-    place = check_device(device)
-    resolve(backend, place)
-    check_packages(*packages)
-    return place
 
 
 def check_packages(*packages: str) -> None:

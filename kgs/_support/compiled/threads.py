@@ -38,7 +38,9 @@ class _Work:
 _helpers: list[SimpleQueue[_Work]] = []  # a queue of each thread
 
 
-def parallel_for(threads: int, count: int, kernel: Callable[..., None], *arguments: Any, pieces: int | None = None) -> None:
+def parallel_for(
+    threads: int, count: int, kernel: Callable[..., None], *arguments: Any, pieces: int | None = None
+) -> None:
     """Call `kernel(begin, end, *arguments)` on ranges that make up 0 .. count, on at most `threads` threads.
 
     The ranges do not depend on the number of threads: the last turns of a vector loop are scalar and may round
