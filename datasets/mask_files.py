@@ -39,7 +39,7 @@ class MaskFiles(NamedTuple):
     unused: list[Path]  # files that fit no photo or are of one that has a mask, and folders that are named like masks
 
     def notes(self, root: Path, max_names: int) -> list[str]:
-        """A sentence that names up to `max_names` of what is not used, relative to the scene's folder; [] for nothing."""
+        """A sentence that names up to `max_names` files that are not used, relative to the scene's folder; or []."""
         names = [path.relative_to(root) if path.is_relative_to(root) else path for path in self.unused]
         return [f"named like masks and not used: {listed(names, max_names)}: {MASKS_ARE_IN}"] if names else []
 

@@ -35,8 +35,8 @@ class Views:
         alphas: `(V, 1, H, W)` in [0, 1], the images' alpha channel, or None.
         border_mask: `(H, W)` in [0, 1], the share of light that each pixel lets through, the same in all images, or
             None: 1 everywhere. It is below 1 in the dark border that removing a lens's distortion can leave.
-        valid_mask: bool `(V, H, W)`, the pixels that count, or None: all. Where somebody walked by, nothing is compared,
-            and no keypoints or initial points are taken.
+        valid_mask: bool `(V, H, W)`, the pixels that count, or None: all. Where somebody walked by, nothing is
+            compared, and no keypoints or initial points are taken.
         gains: `(V, 3)` above 0, the factors of the scene's colours in each photo: its exposure and white balance; or
             None: 1. They are estimated before a fit, and loaders set none.
         turned: whether each photo was turned by a quarter clockwise, and its camera with it, to have the size of the
@@ -222,7 +222,8 @@ class Scene:
         offset: `(3,)` float64, subtracted from the world's coordinates on loading; exports add it back.
         background: `(3,)`, the colour behind the scene, in [0, 1].
         root: the folder the scene was read from.
-        train_full_size: the training views at a higher resolution, to find initial points in; None if `train` is as fine.
+        train_full_size: the training views at a higher resolution, to find initial points in; None if `train` is as
+            fine.
         notes: what the files say that is not used, one sentence each, to be shown to the user.
     """
 

@@ -183,7 +183,7 @@ def _dropped(x: Tensor, rate: Rate, generator: Generator | None, scale: bool) ->
 
 
 def _warn(message: str) -> None:
-    """Warn at the line that called the layer: not in this file, torch or kgs. As `kgs._support.errors.warn`, without kgs."""
+    """Warn at the line that called the layer: not in this file, torch or kgs. As kgs' own `warn`, without kgs."""
     names = [call.frame.f_globals.get("__name__", "") for call in inspect.stack(context=0)]
     outside = [not f"{name}.".startswith(("torch.", "kgs.", f"{__name__}.")) for name in [*names, ""]]
     warnings.warn(f"DropGaussian: {message}", stacklevel=outside.index(True) + 1)

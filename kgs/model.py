@@ -199,7 +199,7 @@ class GaussianModel(nn.Module):
 
 
 class _JoinedBands(torch.autograd.Function):
-    """Concatenate `sh_dc` and the first bands of `sh_rest`, as `torch.cat` does, in buffers of `kgs._support.memory`."""
+    """Concatenate `sh_dc` and the first bands of `sh_rest`, as `torch.cat` does, in buffers that are used again."""
 
     @staticmethod
     def forward(ctx: Any, sh_dc: Tensor, sh_rest: Tensor, bands: int) -> Tensor:

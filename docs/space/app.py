@@ -128,8 +128,8 @@ def kill(process: subprocess.Popen[bytes]) -> None:
 ABOUT = f"""
 # Photos in, page out
 
-Upload {MIN_PHOTOS} to {MAX_PHOTOS} photos of something that does not move, with a step to the side between them, as your camera
-wrote them. You get a page in which you can look around: Gaussian splatting by kgs.
+Upload {MIN_PHOTOS} to {MAX_PHOTOS} photos of something that does not move, with a step to the side between them, as
+your camera wrote them. You get a page in which you can look around: Gaussian splatting by kgs.
 
 Keep this page open: what nobody waits for is stopped. A job takes some minutes, {MINUTES} at most. Photos and results
 are deleted from this server after about {KEPT_MINUTES} minutes.

@@ -33,7 +33,7 @@ class Target(NamedTuple):
         return image if self.mask is None else image * self.mask
 
     def background_before_gain(self, background: Tensor | None) -> Tensor | None:
-        """The background to render with, so that :meth:`as_photographed` shows this one, `(3,)`: gains do not apply to it."""
+        """The background to render with, so that :meth:`as_photographed` shows this one, `(3,)`."""
         return background if self.gains is None or background is None else background / self.gains[:, 0, 0]
 
     def over_background(self, background: Tensor, backend: str) -> Self:

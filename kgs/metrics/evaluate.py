@@ -43,8 +43,8 @@ def evaluate(
 
     `render` is called with a camera and, where views have gains, with gains, as :meth:`kgs.fit.Fit.render` takes them.
 
-    With `correct_color`, each channel of a render first gets the gain and the offset that fit it best to the photo: what
-    exposure and white balance of a held-out photo do is then not counted. Where views have gains, and masks let a
+    With `correct_color`, each channel of a render first gets the gain and the offset that fit it best to the photo:
+    what exposure and white balance of a held-out photo do is then not counted. Where views have gains, and masks let a
     background show through, only the colours of the scene get them.
 
     `look` is called with the number of each view and its render, as :meth:`kgs.datasets.scene.Views.render` returns it.
@@ -89,7 +89,7 @@ def evaluate(
 
 
 def views_to_correct(scene: Scene) -> Views:
-    """The test views for `correct_color`: where the training views have gains, with gains of 1, as `render` takes gains."""
+    """The test views for `correct_color`; with gains of 1 where the training views have gains."""
     views = scene.test
     return views if scene.train.gains is None else replace(views, gains=torch.ones(len(views), 3))
 

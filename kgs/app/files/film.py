@@ -41,8 +41,8 @@ def write_film(
 ) -> str:
     """Write a film along the :func:`camera_path` through some views, as MP4 or WebM by the suffix. The write is atomic.
 
-    The film has `FRAMES` frames at `RATE` frames per second; see :func:`resample_by_speed` for its speed. Frames have the size of
-    the views, reduced to at most `LONGEST` pixels and rounded to even numbers.
+    The film has `FRAMES` frames at `RATE` frames per second; see :func:`resample_by_speed` for its speed. Frames have
+    the size of the views, reduced to at most `LONGEST` pixels and rounded to even numbers.
 
     Args:
         path: the file to write, in an existing folder; see :func:`kgs.app.files.encoders.film_suffix`.

@@ -51,8 +51,8 @@ def viewer_scene(
         pyramid: depth of the pyramids that stand for the cameras, in world units.
         arc: how far around the scene the cameras reach, see `_arc`.
         turned: `up` and `arc` where the pictures are turned clockwise by one, two and three quarters.
-        tour: the rotations and positions of the cameras of the film, see :func:`kgs.app.files.film.resample_by_speed` (poses), and
-            its length (seconds).
+        tour: the rotations and positions of the cameras of the film, see :func:`kgs.app.files.film.resample_by_speed`
+            (poses), and its length (seconds).
     """
     positions = camera_centers(cameras.extrinsics).numpy()
     points = means.detach().cpu().double().numpy()

@@ -21,7 +21,8 @@ def unlike_others(photos: list[OpenPhoto]) -> dict[str, str]:
     """Photos that are copies, or of another shape than most without a focal length in their Exif, and why.
 
     Raises:
-        DataError: most photos are panoramas, there are fewer than `MIN_PHOTOS` without copies, or no shape is that of most.
+        DataError: most photos are panoramas, there are fewer than `MIN_PHOTOS` without copies, or no shape is that of
+            most.
     """
     folder = photos[0].path.parent
     panoramas = [photo.path for photo in photos if photo.is_panorama]

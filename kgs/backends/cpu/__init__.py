@@ -7,9 +7,9 @@ used.
 
 Rules that keep the kernels fast. Breaking any of them cost a measured factor of 1.5 to 3, without any warning:
 
-1. Pixels of a tile are the lanes of SIMD: kernels that loop over pixels of tiles use the `Lanes` of `kgs._support.compiled`, and
-   what runs from layer to layer stays in them. Other loops, over columns, read and write arrays at constant distances;
-   otherwise LLVM finds dependences and the loop stays scalar.
+1. Pixels of a tile are the lanes of SIMD: kernels that loop over pixels of tiles use the `Lanes` of
+   `kgs._support.compiled`, and what runs from layer to layer stays in them. Other loops, over columns, read and write
+   arrays at constant distances; otherwise LLVM finds dependences and the loop stays scalar.
 2. An index of an array must be provably >= 0, because indices wrap: a loop that counts down masks its index.
 3. `fastmath` lets sums be reassociated; NaN and infinity keep their meaning.
 4. Literals are float64 in numba: every constant is an `np.float32`.

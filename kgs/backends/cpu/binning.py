@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kgs._support.compiled.lanes import WIDTH
+from kgs._support.compiled.threads import parallel_for
 from kgs._support.memory import array
 
 from .binning_kernels import (

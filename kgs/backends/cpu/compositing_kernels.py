@@ -88,16 +88,17 @@ def gather(table, entries, first, n, corner, feature, channels, layers):
 def find_strips(layers, n, log_threshold, strips):
     """Set bit k of `strips[s]`, for the n layers of a chunk, where layer k may reach strip s: elsewhere its alpha is 0.
 
-    With log2 alpha = l - |v|^2, v = W (dx, dy), and `log_threshold` the log2 of the threshold, a layer reaches a pixel where
-    |v|^2 <= l - log_threshold. On a row, dy is given, and |v|^2 is least at dx = -dy (w0 . w1) / (w0 . w0), w0 and w1 being the
-    columns of W, or at the end of the row that is closer to it. A strip is missed where both of its rows are.
+    With log2 alpha = l - |v|^2, v = W (dx, dy), and `log_threshold` the log2 of the threshold, a layer reaches a pixel
+    where |v|^2 <= l - log_threshold. On a row, dy is given, and |v|^2 is least at dx = -dy (w0 . w1) / (w0 . w0), w0
+    and w1 being the columns of W, or at the end of the row that is closer to it. A strip is missed where both of its
+    rows are.
 
     What is missed must be 0 with all roundings, so the bound is wider. Let M^2 = far_x^2 |w0|^2 + far_y^2 |w1|^2 with
-    the largest |dx| and |dy| of the tile, and u = 2^-24. Here and in `alpha_of`, together, the error of v is below
-    e = 8 sqrt(2) u M, and |v|^2 >= (1 - t) |v + e|^2 - e^2 / t for any t; with t = 2^-10, e^2 / t is 2^-31 M^2. The
-    other roundings, of the exponent, of 2^x and of `log_threshold`, are below 1e-4. A bound that is not a number or infinite is
-    exceeded by nothing, and all strips are reached. In the forward pass a feature that is not finite therefore spreads
-    to all pixels of the strips that its layer reaches, but not beyond.
+    the largest |dx| and |dy| of the tile, and u = 2^-24. Here and in `alpha_of`, together, the error of v is below e =
+    8 sqrt(2) u M, and |v|^2 >= (1 - t) |v + e|^2 - e^2 / t for any t; with t = 2^-10, e^2 / t is 2^-31 M^2. The other
+    roundings, of the exponent, of 2^x and of `log_threshold`, are below 1e-4. A bound that is not a number or infinite
+    is exceeded by nothing, and all strips are reached. In the forward pass a feature that is not finite therefore
+    spreads to all pixels of the strips that its layer reaches, but not beyond.
     """
     for s in range(STRIPS):
         strips[s] = 0
