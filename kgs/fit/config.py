@@ -120,7 +120,7 @@ class FitConfig:
 
     Args:
         steps: number of training steps, to which the recipe's counts are scaled. Unless given: 900 for up to three
-            views; 900 to 1800 for more, by how many photos show a place.
+            views; 900 to 1400 for more, by how many photos show a place.
         drop: final rate of DropGaussian, in [0, 1); 0 leaves the layer out. Unless given: 0.3, and less, down to 0,
             where many photos show the same places.
         drop_schedule: linear: the rate grows with the steps, as in the paper. constant: dropout at that rate.

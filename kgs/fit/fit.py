@@ -67,14 +67,25 @@ class Fit:
             camera: on any device.
             gains: the exposure of a photo, `(3,)`: factors of the Gaussians' colours, not of the background; None: 1.
         """
+        image, _ = self._render(camera, gains)
+        return image
+
+    @torch.no_grad()
+    def render_with_depth(self, camera: PinholeCamera, gains: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """What :meth:`render` and :meth:`median_depth` return, in one render."""
+        image, rendering = self._render(camera, gains, "median_depth")
+        return image, rendering.median_depth[0, 0].cpu()
+
+    def _render(self, camera: PinholeCamera, gains: Tensor | None, *outputs: str) -> tuple[Tensor, Any]:
         camera = move_camera(camera, self.device)
+        background = self._background if gains is None else None
+        outputs = ("image", *outputs) if gains is None else ("image", "alpha", *outputs)
         with threads_beside(self.backend):
-            if gains is None:
-                image: Tensor = self._renderer(self.model(), camera, self._background).image
-                return image
-            rendering: Any = self._renderer(self.model(), camera, outputs=("image", "alpha"))
+            rendering: Any = self._renderer(self.model(), camera, background, outputs=outputs)
+        if gains is None:
+            return rendering.image, rendering
         exposed = rendering.image * gains.to(rendering.image)[:, None, None]
-        return blend(exposed, 1.0 - rendering.alpha, self._background)
+        return blend(exposed, 1.0 - rendering.alpha, self._background), rendering
 
     @torch.no_grad()
     def median_depth(self, camera: PinholeCamera) -> Tensor:

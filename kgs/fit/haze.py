@@ -34,11 +34,13 @@ def veils(fit: Fit) -> Tensor:
     if fit.scene.background.any():
         return found
     for view in select_evenly(len(views), min(len(views), MAX_VIEWS)):
-        shown, photo, _ = views.compared(view, views.render(view, fit.render))
+        camera = views.camera(view)
+        gains = None if views.gains is None else views.gains[view]
+        image, surface = fit.render_with_depth(camera, gains)
+        shown, photo, _ = views.compared(view, image)
         is_hazy = (darkest(shown[0]) - darkest(photo) > HAZE).cpu()
-        surface = fit.median_depth(views.camera(view))
         height, width = surface.shape
-        pixels, depths = (values[:, 0] for values in project_points(means, views.camera(view)))
+        pixels, depths = (values[:, 0] for values in project_points(means, camera))
         x, y, is_inside = nearest_pixels(pixels, depths, width, height)
         found |= is_inside & is_hazy[y, x] & (depths < FRONT * surface[y, x])
     return found

@@ -15,7 +15,7 @@ from .config import DROP
 from .plan import FEW, Plan
 
 STEPS_OF_A_PHOTO = 275  # steps for each photo beyond the third that shows a place
-MAX_STEPS = 1800
+MAX_STEPS = 1400
 FEW_TOGETHER = 3.0  # photos that show two places at once: up to so many the rate is `DROP`
 MANY_TOGETHER = 5.0  # from so many on nothing is dropped
 
