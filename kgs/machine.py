@@ -28,12 +28,12 @@ def check_device(name: str) -> torch.device:
     return device
 
 
-def check_tools(device: str, backend: str, *packages: str) -> torch.device:
-    """The device; raises if it, the backend or a package that a command needs is missing."""
-    place = check_device(device)
-    resolve(backend, place)
+def check_tools(name: str, backend: str, *packages: str) -> torch.device:
+    """The device of that name; raises if it, the backend or a package that a command needs is missing."""
+    device = check_device(name)
+    resolve(backend, device)
     check_packages(*packages)
-    return place
+    return device
 
 
 def check_packages(*packages: str) -> None:

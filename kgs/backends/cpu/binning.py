@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kgs.compiled.lanes import WIDTH
+from kgs.compiled.threads import parallel_for
 from kgs.memory import array
 
 from .binning_kernels import (
