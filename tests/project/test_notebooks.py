@@ -219,7 +219,7 @@ def test_one_cell_near_the_top_sets_the_sizes_and_it_is_stored_as_run_from_top_t
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_it_is_small_and_names_no_place_on_a_disk(path):
+def test_it_is_small_and_names_no_path_on_a_disk(path):
     assert path.stat().st_size < 400_000
     notebook = nbformat.read(path, as_version=4)
     texts = [cell.source for cell in notebook.cells]
