@@ -31,7 +31,7 @@ Rotations = dict[str, NDArray[np.float64]]  # by the stems of the photos' names
 
 
 def cameras(*, out: Path, beside: tuple[Path, ...] = (), processes: int | None = None) -> int:
-    """How many of real photos are registered, and how far their cameras are from the given ones (20 minutes; can go on).
+    """How many real photos are registered, and how far their cameras are from the given ones (20 minutes; can go on).
 
     For example:
       KGS_DATA=SCENES python real.py --out cameras --processes 1

@@ -84,8 +84,8 @@ def agreed_cameras(
             raise DataError(folder, "", reason)
         solvers = _Solvers((first, second), second_matches, images, work, seed, exif_focals(photos), executor, pairs)
         solutions, held = solvers.solve(kept)
-        while unplaced := without_cameras(solutions, list(kept.values()), pairs):
-            left_out |= unplaced
+        while untrusted := without_cameras(solutions, list(kept.values()), pairs):
+            left_out |= untrusted
             kept = {image: name for image, name in kept.items() if name not in left_out}
             solutions, held = solvers.solve(kept)
         lap("cameras")
