@@ -122,12 +122,12 @@ def initial_points(
         warn(f"{message}the fit starts from {count} random points instead")
     near, far = depth_range(tracked, geometry)
     points = _random_points(geometry, count, near, far, generator)
-    pixels, depths = geometry.project(points)
-    inside = geometry.inside_images(pixels, depths, near, far)
+    projected, depths = geometry.project(points)
+    inside = geometry.inside_images(projected, depths, near, far)
     usable = views.usable
     if usable is not None:
-        inside &= _values_at(usable[:, None].float(), pixels)[..., 0] > 0.5
-    colors = _mean_colors(views.images, pixels, inside)
+        inside &= _values_at(usable[:, None].float(), projected)[..., 0] > 0.5
+    colors = _mean_colors(views.images, projected, inside)
     return InitialPoints(points.float(), colors, "random")
 
 
