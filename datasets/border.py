@@ -27,9 +27,9 @@ def with_border(train: Views) -> Views:
 def find_border_mask(images: Tensor) -> Tensor | None:
     """The share of light that each pixel of these photos lets through, `(H, W)`: below 1 in a dark border.
 
-    A border lies at the same place in all photos, whatever they show, and ends within 2 % of the width or height; its
-    thickness may vary along a side. An edge that is dark in only some photos belongs to the scene, and so does a dark
-    edge that is wider, or whose surroundings are dark too.
+    A border lies at the same position in all photos, whatever they show, and ends within 2 % of the width or height;
+    its thickness may vary along a side. An edge that is dark in only some photos belongs to the scene, and so does a
+    dark edge that is wider, or whose surroundings are dark too.
 
     Args:
         images: at least two photos of one camera, `(V, 3, H, W)` in [0, 1].

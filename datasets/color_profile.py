@@ -20,7 +20,7 @@ _PROBE = np.stack(np.meshgrid(*[np.linspace(0, 255, 9).round()] * 3, indexing="i
 _MODES = {"RGB": "RGB", "GRAY": "L"}  # those of Pillow by the space of a profile
 _USUAL_GAMMA = 2.2
 _SAME_GAMMA = 0.05  # relative; what is this close to 2.2 means sRGB's curve if the primaries are its, as libpng has it
-_SAME_PLACE = 0.003  # of a chromaticity
+_SAME_CHROMATICITY = 0.003
 _ROWS = 256  # that are converted at once: what is needed for more takes memory
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 _D65 = (0.3127, 0.3290)
@@ -55,8 +55,8 @@ class Colors(NamedTuple):
         """Those of a file's numbers: x and y of white, and of red, green and blue; None where they are damaged."""
         try:
             numbers = [float(number) for number in (*white, *primaries, gamma or 1)]
-            places = tuple(zip(numbers[:8:2], numbers[1:8:2], strict=True))
-            described = cls(places[1:], places[0], numbers[8] if gamma else None)
+            chromaticities = tuple(zip(numbers[:8:2], numbers[1:8:2], strict=True))
+            described = cls(chromaticities[1:], chromaticities[0], numbers[8] if gamma else None)
             matrix = _to_xyz(described.primaries, described.white)
         except (TypeError, ValueError, ArithmeticError, IndexError, np.linalg.LinAlgError):
             return None
@@ -65,9 +65,9 @@ class Colors(NamedTuple):
     @property
     def is_srgb(self) -> bool:
         """Whether they are sRGB, or nearly so."""
-        places = np.abs(np.subtract([*self.primaries, self.white], [*_BT709, _D65]))
+        differences = np.abs(np.subtract([*self.primaries, self.white], [*_BT709, _D65]))
         gamma = self.gamma or _USUAL_GAMMA
-        return bool(places.max() <= _SAME_PLACE and abs(gamma / _USUAL_GAMMA - 1) <= _SAME_GAMMA)
+        return bool(differences.max() <= _SAME_CHROMATICITY and abs(gamma / _USUAL_GAMMA - 1) <= _SAME_GAMMA)
 
 
 ADOBE_RGB = Colors(((0.64, 0.33), (0.21, 0.71), (0.15, 0.06)), _D65, 563 / 256)
@@ -186,7 +186,7 @@ def _encoded(values: NDArray[np.float32], gamma: float | None, matrix: NDArray[n
 
 def _to_xyz(primaries: tuple[tuple[float, float], ...], white: tuple[float, float]) -> NDArray[np.float64]:
     """The matrix from linear RGB to XYZ; white has Y = 1."""
-    columns = np.stack([_xyz(place) for place in primaries], axis=1)
+    columns = np.stack([_xyz(primary) for primary in primaries], axis=1)
     return np.asarray(columns * np.linalg.solve(columns, _xyz(white)))
 
 
@@ -196,6 +196,6 @@ def _adaptation(white: tuple[float, float]) -> NDArray[np.float64]:
     return np.asarray(np.linalg.inv(_BRADFORD) @ np.diag(ratio) @ _BRADFORD)
 
 
-def _xyz(place: tuple[float, float]) -> NDArray[np.float64]:
-    x, y = place
+def _xyz(chromaticity: tuple[float, float]) -> NDArray[np.float64]:
+    x, y = chromaticity
     return np.array([x / y, 1.0, (1 - x - y) / y])

@@ -152,11 +152,11 @@ def photo_of_mask(mask: Path) -> tuple[str, bool]:
     return (match[1] or match[2], True) if match else (stem, False)
 
 
-def mask_folders(places: Iterable[Path]) -> list[Path]:
+def mask_folders(outer_folders: Iterable[Path]) -> list[Path]:
     """The folders of masks in other folders: `masks` first, then `mask`, in upper or lower case."""
     found = []
-    for place in filter(Path.is_dir, places):
-        inner = [path for path in sorted(place.iterdir()) if path.name.lower() in MASK_FOLDERS and path.is_dir()]
+    for outer in filter(Path.is_dir, outer_folders):
+        inner = [path for path in sorted(outer.iterdir()) if path.name.lower() in MASK_FOLDERS and path.is_dir()]
         found += sorted(inner, key=lambda path: MASK_FOLDERS.index(path.name.lower()))
     return found
 

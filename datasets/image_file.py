@@ -286,9 +286,9 @@ def _profile(kind: str, image: Opened, file: IO[bytes], chunks: dict[bytes, byte
     if kind == "PNG" and "srgb" in image.info:
         return Colors()
     if kind == "PNG" and ("gamma" in image.info or "chromaticity" in image.info):
-        places = image.info.get("chromaticity") or (*Colors().white, *sum(Colors().primaries, ()))
+        chromaticities = image.info.get("chromaticity") or (*Colors().white, *sum(Colors().primaries, ()))
         exponent = image.info.get("gamma")
-        return Colors.of(places[:2], places[2:], 1 / exponent if exponent else None) or b""
+        return Colors.of(chromaticities[:2], chromaticities[2:], 1 / exponent if exponent else None) or b""
     nclx = image.info.get("nclx_profile")
     if nclx and (nclx["color_primaries"], nclx["transfer_characteristics"]) != _UNSPECIFIED:
         return colors_of(nclx["color_primaries"], nclx["transfer_characteristics"])

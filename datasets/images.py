@@ -93,7 +93,7 @@ def resize(
 
 
 def remap(image: Image, maps: Maps | None, weights: Image | None = None) -> Image:
-    """Take each pixel from the place that the maps give, weighted as :func:`weighted` says; without maps the image."""
+    """Take each pixel from its position in the maps, weighted as :func:`weighted` says; without maps the image."""
     if maps is None:
         return image
 
@@ -104,10 +104,10 @@ def remap(image: Image, maps: Maps | None, weights: Image | None = None) -> Imag
 
 
 def rectification(intrinsics: Intrinsics) -> tuple[Intrinsics, Maps | None]:
-    """The pinhole camera that replaces a lens, and the places of its pixels in the lens's image.
+    """The pinhole camera that replaces a lens, and the positions of its pixels in the lens's image.
 
     The principal point stays. The focal length stays too, unless that would leave pixels blank (pincushion distortion):
-    then it grows, by one factor on both axes, until the image covers every pixel. The places are x and y, `(H, W)`
+    then it grows, by one factor on both axes, until the image covers every pixel. The positions are x and y, `(H, W)`
     each, or None without distortion. A ValueError if coefficients fold the image, or it is too long for OpenCV.
     """
     if not intrinsics.fisheye and not any(intrinsics.distortion):

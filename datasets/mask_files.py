@@ -1,4 +1,4 @@
-"""Which files are the masks of photos, judged by their names and places; loads neither NumPy nor torch.
+"""Which files are the masks of photos, judged by their names and folders; loads neither NumPy nor torch.
 
 A mask has the photo's stem (or its whole name before the ending, as COLMAP writes them), alone or with `_mask` behind
 it or `mask_` before it, and lies in `masks/` or `mask/` beside the photo, beside one of the folders that it is in, or
@@ -58,23 +58,23 @@ def find_mask_files(photos: Sequence[Path], root: Path, folder: Path | None = No
     """
     if folder is not None and not folder.is_dir():
         raise DataError(folder, "", "expected a folder of masks, found no such folder")
-    parents = [place for place in sorted({photo.parent for photo in photos}) if place.is_dir()]
-    on_disk = _by_name(photo for place in parents for photo in list_images(place))
-    places = _places(root, parents)
-    searched = {place: photos for place in [folder] if place is not None} or {
-        inner: [photo for photo in photos if place == root or photo.is_relative_to(place)]
-        for place in places
-        for inner in mask_folders([place])
+    parents = [parent for parent in sorted({photo.parent for photo in photos}) if parent.is_dir()]
+    on_disk = _by_name(photo for parent in parents for photo in list_images(parent))
+    outer_folders = _outer_folders(root, parents)
+    searched = {only: photos for only in [folder] if only is not None} or {
+        inner: [photo for photo in photos if outer == root or photo.is_relative_to(outer)]
+        for outer in outer_folders
+        for inner in mask_folders([outer])
         if inner not in parents
     }
     keeping = dict[Path, Path]()
     unused = list[Path]()
     is_strict = True
-    for place, own in searched.items():
-        masks, others = _pictures(place, own)
+    for searched_folder, own in searched.items():
+        masks, others = _pictures(searched_folder, own)
         if folder is not None and not masks:
             raise DataError(folder, "", "expected masks, pictures with the stems of the photos, found none")
-        found, unfit = _of_folder(place, masks, own, on_disk, is_strict)
+        found, unfit = _of_folder(searched_folder, masks, own, on_disk, is_strict)
         is_strict = is_strict and not masks
         unused += [*others, *unfit, *(mask for photo, mask in found.items() if photo in keeping)]
         keeping = found | keeping
@@ -87,14 +87,14 @@ def find_mask_files(photos: Sequence[Path], root: Path, folder: Path | None = No
     moving = {photo: path for photo, path in moving.items() if photo not in keeping}
     unused += _like_masks_beside(photos, parents, on_disk)
     if folder is None:
-        unused += _like_mask_folders(places, {photo for photo in photos if photo not in keeping | moving})
+        unused += _like_mask_folders(outer_folders, {photo for photo in photos if photo not in keeping | moving})
     return MaskFiles(keeping, moving, unused)
 
 
-def _places(root: Path, parents: Sequence[Path]) -> list[Path]:
+def _outer_folders(root: Path, parents: Sequence[Path]) -> list[Path]:
     """The scene's folder, those of its photos, and those between."""
-    between = [place for parent in parents if parent.is_relative_to(root) for place in parent.parents]
-    inside = sorted({place for place in [*parents, *between] if place.is_relative_to(root)})
+    between = [outer for parent in parents if parent.is_relative_to(root) for outer in parent.parents]
+    inside = sorted({path for path in [*parents, *between] if path.is_relative_to(root)})
     return [*dict.fromkeys([root, *inside, *parents])]
 
 
@@ -103,12 +103,12 @@ def _pictures(folder: Path, photos: Sequence[Path]) -> tuple[list[Path], list[Pa
     parents = {_lower(photo.parent) for photo in photos}
     masks = list[Path]()
     others = list[Path]()
-    for place, folders, files in os.walk(folder):
+    for directory, folders, files in os.walk(folder):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
-        inner = _lower(Path(place).relative_to(folder))
+        inner = _lower(Path(directory).relative_to(folder))
         is_read = any(_ends(parent, inner) for parent in parents)
         for name in sorted(files):
-            path = Path(place, name)
+            path = Path(directory, name)
             if path.suffix.lower() in _SUFFIXES and not name.startswith("."):
                 (masks if is_read and path.suffix.lower() in IMAGE_SUFFIXES else others).append(path)
     return masks, others
@@ -168,8 +168,8 @@ def _beside(photos: Sequence[Path], parents: Sequence[Path]) -> dict[Path, Path]
     """The masks that lie among the photos and say by their names that they are."""
     found = dict[Path, Path]()
     known = set(photos)
-    for place in parents:
-        for mask, photo in masks_beside(place).items():
+    for parent in parents:
+        for mask, photo in masks_beside(parent).items():
             if photo not in known or mask in known:
                 continue
             if photo in found:
@@ -181,8 +181,8 @@ def _beside(photos: Sequence[Path], parents: Sequence[Path]) -> dict[Path, Path]
 def _like_masks_beside(photos: Sequence[Path], parents: Sequence[Path], on_disk: dict[str, list[Path]]) -> list[Path]:
     """Pictures among the photos, but none of them, that are named like masks of no photo there."""
     known = set(photos)
-    like = [path for place in parents for path in list_images(place) if is_like_mask(path) and path not in known]
-    dynamic = [path for place in parents for path in sorted(place.glob(f"{MASK_FILES}*"))]
+    like = [path for parent in parents for path in list_images(parent) if is_like_mask(path) and path not in known]
+    dynamic = [path for parent in parents for path in sorted(parent.glob(f"{MASK_FILES}*"))]
     return like + [
         path
         for path in dynamic
@@ -191,10 +191,12 @@ def _like_masks_beside(photos: Sequence[Path], parents: Sequence[Path], on_disk:
     ]
 
 
-def _like_mask_folders(places: Sequence[Path], photos: set[Path]) -> list[Path]:
+def _like_mask_folders(outer_folders: Sequence[Path], photos: set[Path]) -> list[Path]:
     """Folders that are named like masks, but not as `mask_folders`, and hold pictures named as one of these photos."""
     stems = {photo.stem.lower() for photo in photos}
-    folders = [path for place in filter(Path.is_dir, places) for path in sorted(place.iterdir()) if path.is_dir()]
-    known = {*places, *mask_folders(places)}
+    folders = [
+        path for outer in filter(Path.is_dir, outer_folders) for path in sorted(outer.iterdir()) if path.is_dir()
+    ]
+    known = {*outer_folders, *mask_folders(outer_folders)}
     like = [path for path in folders if is_like_mask(path) and path not in known]
     return [path for path in like if any(photo_of_mask(picture)[0] in stems for picture in list_pictures(path))]

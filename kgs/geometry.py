@@ -200,8 +200,8 @@ def log_spacing(points: Tensor) -> Tensor:
     """Logarithm of the root mean squared distance to the three nearest points, float64 `(N,)`.
 
     The initial scale of Gaussians. It is at least a thousandth of the cloud's median spacing, because points may
-    coincide. Where points coincide in groups of four or more and more than half of the places hold three or more (the
-    triangles of an STL), distances are those between places.
+    coincide. Where points coincide in groups of four or more and more than half of the distinct points occur three or
+    more times (the triangles of an STL), distances are those between distinct points.
 
     Args:
         points: `(N, 3)`, N >= 4, finite, not all in one place; else a ValueError.
@@ -213,13 +213,13 @@ def log_spacing(points: Tensor) -> Tensor:
     size = centred.abs().amax()
     if not 0.0 < float(size) < math.inf:
         raise ValueError(f"points: expected points in different places, got a cloud of half size {float(size):g}")
-    centred = centred / size  # float32 then suffices to find the neighbours, whatever the unit and place of the cloud
+    centred = centred / size  # float32 then suffices to find the neighbours, whatever the cloud's unit and position
     centred = centred.masked_fill(centred.abs() < 1e-100, 0.0)  # its square would be 0
     squared = _mean_squared_distance(centred)
     if not bool(squared.all()):
-        places, inverse, counts = centred.unique(dim=0, return_inverse=True, return_counts=True)
-        if 2 * int((counts >= NEIGHBOURS).sum()) > len(places):
-            squared = _mean_squared_distance(places).index_select(0, inverse)
+        distinct, inverse, counts = centred.unique(dim=0, return_inverse=True, return_counts=True)
+        if 2 * int((counts >= NEIGHBOURS).sum()) > len(distinct):
+            squared = _mean_squared_distance(distinct).index_select(0, inverse)
     typical = squared[squared > 0].median()
     return 0.5 * squared.clamp(min=MIN_RELATIVE_SPACING**2 * typical).log() + size.log()
 

@@ -36,8 +36,8 @@ class _Setup(NamedTuple):
     """A world, and how it is photographed."""
 
     world: World
-    place: Callable[[int, int, np.random.Generator], tuple[Array, Array]]  # places of so many training and test cameras
-    beyond: Callable[[int, float], Array]  # places of so many cameras, so many times as far out as the training cameras
+    eyes: Callable[[int, int, np.random.Generator], tuple[Array, Array]]  # of so many training and test cameras
+    beyond: Callable[[int, float], Array]  # eyes of so many cameras, so many times as far out as the training cameras
     center: Array  # (3,), what they look at
     focal: float  # focal length over the longer side of the image
 
@@ -58,7 +58,7 @@ def synthetic_scene(
         train_views: at least 1.
         test_views: at least 0.
         size: (height, width) of all images in pixels. The field of view is 58 degrees along the longer side.
-        seed: of places, textures and cameras, at least 0. The same seed gives the same scene, without points.
+        seed: of positions, textures and cameras, at least 0. The same seed gives the same scene, without points.
 
     Raises:
         ValueError: the kind is unknown, or a number is out of range.
@@ -72,7 +72,7 @@ def synthetic_scene(
         if value < minimum:
             raise ValueError(f"{name}: expected at least {minimum}, got {value}")
     setup = _setup(kind, seed)
-    train_eyes, test_eyes = setup.place(train_views, test_views, np.random.default_rng([seed, 1]))
+    train_eyes, test_eyes = setup.eyes(train_views, test_views, np.random.default_rng([seed, 1]))
     with torch.device("cpu"):  # whatever torch's default is
         train = _views(setup, train_eyes, size, "train")
         test = _views(setup, test_eyes, size, "test")
@@ -84,10 +84,10 @@ def synthetic_scene(
 def synthetic_views(
     eyes: NDArray[np.float64], kind: str = "room", size: tuple[int, int] = (126, 168), seed: int = 0
 ) -> Views:
-    """Images of the synthetic scene from given places; all cameras are upright and look at the middle of the scene.
+    """Images of the synthetic scene from given positions; all cameras are upright and look at the middle of the scene.
 
     Args:
-        eyes: places of the cameras relative to the middle of the scene, `(V, 3)`; y points down.
+        eyes: positions of the cameras relative to the middle of the scene, `(V, 3)`; y points down.
         kind: as given to `synthetic_scene`.
         size: as given to `synthetic_scene`.
         seed: as given to `synthetic_scene`.
@@ -97,11 +97,11 @@ def synthetic_views(
 
 
 def views_beyond(kind: str, out: float, count: int = 6, size: tuple[int, int] = (126, 168), seed: int = 0) -> Views:
-    """Images of the synthetic scene from places `out` times as far from the middle of the training cameras as these.
+    """Images of the synthetic scene from positions `out` times as far from the middle of the training cameras as these.
 
-    The places are evenly spread over an ellipse whose half axes are those of the patch of the training cameras (of the
-    arc: an angle around the table, and a height), times `out`. Of the "orbit" it is a circle `out` times as large. All
-    cameras look at the middle of the scene.
+    The positions are evenly spread over an ellipse whose half axes are those of the patch of the training cameras (of
+    the arc: an angle around the table, and a height), times `out`. Of the "orbit" it is a circle `out` times as large.
+    All cameras look at the middle of the scene.
 
     Args:
         kind: as given to `synthetic_scene`.
@@ -223,7 +223,7 @@ def _eyes_beyond_arc(count: int, out: float) -> Array:
 
 
 def _on_arc(flat: Array) -> Array:
-    """Places `(n, 3)` of coordinates `(n, 2)` along the arc and up, in halves of its extent."""
+    """Positions `(n, 3)` of coordinates `(n, 2)` along the arc and up, in halves of its extent."""
     angles = ARC_SPAN * flat[:, 0]
     heights = ARC_HEIGHT * flat[:, 1]
     return np.asarray(ARC_CENTER + ARC_RADIUS * np.stack([np.sin(angles), heights / ARC_RADIUS, -np.cos(angles)], -1))
@@ -244,13 +244,13 @@ def _eyes_beyond_orbit(count: int, out: float) -> Array:
 
 
 def _on_circle(angles: Array, heights: Array, radius: float) -> Array:
-    """Places `(n, 3)` around the table; heights are above `garden.CENTER`."""
+    """Positions `(n, 3)` around the table; heights are above `garden.CENTER`."""
     away = np.stack([radius * np.sin(angles), -heights, -radius * np.cos(angles)], axis=-1)
     return np.asarray(garden.CENTER + away)
 
 
 def _zigzag(train: int, test: int, rng: np.random.Generator) -> Array:
-    """Coordinates `(train + test, 2)`: a zigzag in [-1, 1] x [-0.5, 0.5], and places spread over a square of 1.15."""
+    """Coordinates `(train + test, 2)`: a zigzag in [-1, 1] x [-0.5, 0.5], and points spread over a square of 1.15."""
     x = np.linspace(-1.0, 1.0, train) if train > 1 else np.zeros(1)
     # M. Roberts' R2 sequence: evenly spread, however many there are
     spread = (rng.uniform(size=2) + np.outer(np.arange(test), [0.7548776662466927, 0.5698402909980532])) % 1.0
@@ -258,7 +258,7 @@ def _zigzag(train: int, test: int, rng: np.random.Generator) -> Array:
 
 
 def _ellipse(count: int) -> Array:
-    """Places `(n, 3)` evenly spread over the unit circle in the plane z = 0, the first at the right."""
+    """Positions `(n, 3)` evenly spread over the unit circle in the plane z = 0, the first at the right."""
     turn = 2 * np.pi * np.arange(count) / count
     return np.stack([np.cos(turn), np.sin(turn), np.zeros(count)], axis=-1)
 

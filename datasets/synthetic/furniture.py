@@ -87,8 +87,8 @@ def table(rng: np.random.Generator, width: float, depth: float, height: float) -
     for x in (-1, 1):
         for y in (-1, 1):
             leg = lathe([(0.0, 0.0), (0.017, 0.0), (0.03, height - 0.045), (0.0, height - 0.045)], 16)
-            place = x * (width / 2 - 0.09), y * (depth / 2 - 0.08), 0.0
-            parts.append(Part(leg.apply_translation(place), wood(rng, (153, 97, 51), along=2)))
+            offset = x * (width / 2 - 0.09), y * (depth / 2 - 0.08), 0.0
+            parts.append(Part(leg.apply_translation(offset), wood(rng, (153, 97, 51), along=2)))
     return parts
 
 

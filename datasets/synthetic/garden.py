@@ -13,7 +13,7 @@ from .pictures import tone
 from .room import things
 from .textures import Array as Numbers
 from .textures import Texture, field
-from .world import Placed, World, make_world, put
+from .world import Instance, World, make_world, put
 
 CENTER = np.array([0.0, -0.55, 1.75])  # what the cameras look at
 RADIUS = 2.3  # m: of the circle of the cameras
@@ -46,7 +46,7 @@ def make_garden(seed: int, far_sky: bool = False) -> World:
     return make_world(ground, [*things(rng), *_around(rng)], SUN, SKY, unlit=sky)
 
 
-def _around(rng: np.random.Generator) -> list[Placed]:
+def _around(rng: np.random.Generator) -> list[Instance]:
     """What stands on the ground around the table: plants and balls, between the table and the cameras' circle."""
     sectors = [tone(hue, 0.75, 0.85) for hue in (0.02, 0.13, 0.58, 0.35)] * 2
     items = [
@@ -55,13 +55,13 @@ def _around(rng: np.random.Generator) -> list[Placed]:
         (make.plant(rng), 5.3),
         (make.ball(0.1, [(236, 190, 62), (242, 240, 230)] * 3), 0.6),
     ]
-    placed = []
+    instances = []
     for parts, angle in items:
         angle += rng.uniform(-0.2, 0.2)
         distance = rng.uniform(1.0, 1.2)
-        place = CENTER[0] + distance * np.sin(angle), CENTER[2] - distance * np.cos(angle)
-        placed += put(parts, *place, 0.0, rng.uniform(0.0, 3.0))
-    return placed
+        position = CENTER[0] + distance * np.sin(angle), CENTER[2] - distance * np.cos(angle)
+        instances += put(parts, *position, 0.0, rng.uniform(0.0, 3.0))
+    return instances
 
 
 def _dome(radius: float) -> trimesh.Trimesh:

@@ -35,8 +35,8 @@ def spine(title: str, length: float, thickness: float, cover: Color, ink: Color)
         picture[:, left : left + band] = ink
     (width, height), _ = cv2.getTextSize(title, _FONT, 1.0, 2)
     scale = min(0.76 * columns / width, 0.62 * rows / height)
-    place = round((columns - scale * width) / 2), round((rows + scale * height) / 2)
-    cv2.putText(picture, title, place, _FONT, scale, ink, max(2, round(2.2 * scale)), cv2.LINE_AA)
+    origin = round((columns - scale * width) / 2), round((rows + scale * height) / 2)
+    cv2.putText(picture, title, origin, _FONT, scale, ink, max(2, round(2.2 * scale)), cv2.LINE_AA)
     return picture
 
 
@@ -58,8 +58,8 @@ def outlook(rng: np.random.Generator, width: float, height: float) -> Picture:
     for x in (0.2, 0.75):
         for shift in (-0.1, 0.0, 0.1):
             axes = round(0.13 * columns), round(0.055 * rows)
-            place = round((x + shift) * columns), round((rng.uniform(0.2, 0.26) + 0.2 * x) * rows)
-            cv2.ellipse(picture, place, axes, 0, 0, 360, (255, 255, 255), cv2.FILLED, cv2.LINE_AA)
+            center = round((x + shift) * columns), round((rng.uniform(0.2, 0.26) + 0.2 * x) * rows)
+            cv2.ellipse(picture, center, axes, 0, 0, 360, (255, 255, 255), cv2.FILLED, cv2.LINE_AA)
     _ridge(picture, rng, 0.68, 0.06, (140, 186, 115))
     _ridge(picture, rng, 0.82, 0.05, (97, 153, 76))
     for x in rng.uniform(0.1, 0.9, size=3):

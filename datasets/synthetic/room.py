@@ -1,6 +1,6 @@
 """The room of the synthetic scene: a table with books, a lamp, a plant and a mug before a wall with a picture.
 
-Titles, colours, pictures and leaves derive from the seed, and so do small differences of place: every seed shows the
+Titles, colours, pictures and leaves derive from the seed, and so do small differences of position: every seed shows the
 same kinds of things. The floor is y = 0.
 """
 
@@ -10,7 +10,7 @@ from . import furniture as make
 from .pictures import landscape, outlook, rug, tone
 from .textures import Array as Numbers
 from .textures import Texture, field
-from .world import Placed, World, make_world, put
+from .world import Instance, World, make_world, put
 
 EYE = np.array([0.0, -0.82, 0.0])  # the middle of the cameras
 PATCH = np.array([0.3, 0.12, 0.04])  # half the extent of the training cameras
@@ -33,7 +33,7 @@ def make_room(seed: int) -> World:
     return make_world(shell, things(rng), SUN, SKY)
 
 
-def _shell(rng: np.random.Generator) -> list[Placed]:
+def _shell(rng: np.random.Generator) -> list[Instance]:
     """Floor, wall, rug, window and picture: nothing stands behind or under them."""
     boards = make.wood(rng, (158, 107, 66), plank=0.14)
     oak = make.wood(rng, (102, 61, 33))
@@ -50,9 +50,9 @@ def _shell(rng: np.random.Generator) -> list[Placed]:
     ]
 
 
-def things(rng: np.random.Generator) -> list[Placed]:
-    """The table with what stands on it, and a ball under it, each a little off the place that is given here."""
-    placed = put(make.table(rng, 1.7, 0.62, TABLE), 0.0, 1.75)
+def things(rng: np.random.Generator) -> list[Instance]:
+    """The table with what stands on it, and a ball under it, each a little off the position that is given here."""
+    instances = put(make.table(rng, 1.7, 0.62, TABLE), 0.0, 1.75)
     titles = rng.permutation(TITLES)
     covers = [tone(hue, rng.uniform(0.65, 0.8), rng.uniform(0.5, 0.75)) for hue in rng.permutation(HUES)]
     x, z = -0.47, TABLE
@@ -61,10 +61,10 @@ def things(rng: np.random.Generator) -> list[Placed]:
         thickness = rng.uniform(0.062, 0.078)
         book = make.book(titles[k], length, 0.22, thickness, covers[k], INKS[k % 2])
         if k < 6:
-            placed += put(book, x, 1.78, TABLE + length / 2, upright=True)
+            instances += put(book, x, 1.78, TABLE + length / 2, upright=True)
             x += thickness + 0.002
         else:
-            placed += put(book, 0.22, 1.72, z, rng.uniform(-0.15, 0.15))
+            instances += put(book, 0.22, 1.72, z, rng.uniform(-0.15, 0.15))
             z += thickness
     sectors = [(217, 51, 41), (247, 204, 64), (41, 115, 178), (242, 237, 224)] * 2
     items = [
@@ -76,8 +76,8 @@ def things(rng: np.random.Generator) -> list[Placed]:
     ]
     for parts, x, y, z, turn in items:
         shift = rng.uniform(-0.025, 0.025, size=2)
-        placed += put(parts, x + shift[0], y + shift[1], z, rng.uniform(-turn, turn))
-    return placed
+        instances += put(parts, x + shift[0], y + shift[1], z, rng.uniform(-turn, turn))
+    return instances
 
 
 def _wallpaper(rng: np.random.Generator) -> Texture:

@@ -1,4 +1,4 @@
-"""Places meshes in a world, and computes their colours in daylight.
+"""Puts meshes into a world, and computes their colours in daylight.
 
 Things are made with z up; frames turn them into OpenCV's axes: x right, y down, z away from the viewer. Lengths are
 metres.
@@ -24,7 +24,7 @@ GAMMA = np.float32(1 / 2.2)  # colours are those of the picture, light is linear
 UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])  # from z up to OpenCV's axes
 
 
-class Placed(NamedTuple):
+class Instance(NamedTuple):
     """A mesh in its own frame, the frame `(4, 4)` in the world, and the mesh's colours."""
 
     mesh: trimesh.Trimesh
@@ -106,11 +106,11 @@ class World:
 
 
 def make_world(
-    shell: Sequence[Placed], things: Sequence[Placed], sun: Array, sky: Array, unlit: Sequence[Placed] = ()
+    shell: Sequence[Instance], things: Sequence[Instance], sun: Array, sky: Array, unlit: Sequence[Instance] = ()
 ) -> World:
     """A world of things in a shell, which casts no shadow, and of unlit parts, which cast none either."""
-    placed = [*unlit, *shell, *things]
-    meshes, frames, textures = zip(*placed, strict=True)
+    instances = [*unlit, *shell, *things]
+    meshes, frames, textures = zip(*instances, strict=True)
     triangles = [mesh.triangles @ frame[:3, :3].T + frame[:3, 3] for mesh, frame in zip(meshes, frames, strict=True)]
     normals = [_normals(mesh) @ frame[:3, :3].T for mesh, frame in zip(meshes, frames, strict=True)]
     sizes = [len(mesh.faces) for mesh in meshes]
@@ -129,11 +129,11 @@ def make_world(
 
 def put(
     parts: Sequence[Part], x: float, y: float, z: float = 0.0, turn: float = 0.0, upright: bool = False
-) -> list[Placed]:
-    """A thing at a place, turned about the vertical; if `upright`, it stands with its right side on top instead."""
+) -> list[Instance]:
+    """A thing at a position, turned about the vertical; if `upright`, it stands with its right side on top instead."""
     frame = euler_matrix(0.0, -np.pi / 2, 0.0) if upright else euler_matrix(0.0, 0.0, turn)
     frame[:3, 3] = x, y, z
-    return [Placed(mesh, UPRIGHT @ frame, texture) for mesh, texture in parts]
+    return [Instance(mesh, UPRIGHT @ frame, texture) for mesh, texture in parts]
 
 
 def _normals(mesh: trimesh.Trimesh) -> Array:

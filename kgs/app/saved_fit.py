@@ -17,7 +17,7 @@ from kgs.fit.checkpoint import newest_checkpoint
 from kgs.fit.config import FitConfig
 from kgs.fit.exposure import with_exposure
 from kgs.fit.fit import Fit
-from kgs.fit.poses import place_cameras
+from kgs.fit.poses import with_extrinsics
 from kgs.fit.state import check_plain
 from kgs.model import GaussianModel
 from kgs.types import RasterOptions
@@ -70,7 +70,7 @@ def load_fit(
         raise DataError(path, "step", reason)
     if damage and say is not None:
         say(f"{damage}; the previous checkpoint is used")
-    scene = _place(_exposed(request.load(out, say), path, values), path, values)
+    scene = _posed(_exposed(request.load(out, say), path, values), path, values)
     options = RasterOptions(near_plane=float(values["near_plane"]), max_bytes=settings.max_bytes)
     return request, Fit(scene, model, options, backend, settings, metrics=metrics)
 
@@ -100,7 +100,7 @@ def _exposed(scene: Scene, path: Path, values: dict[str, Any]) -> Scene:
         raise DataError(path, "decisions", f"expected the gains of {len(scene.train)} photos, got others") from error
 
 
-def _place(scene: Scene, path: Path, values: dict[str, Any]) -> Scene:
+def _posed(scene: Scene, path: Path, values: dict[str, Any]) -> Scene:
     """The scene, with the training cameras where the fit left them."""
     poses = values.get("poses")
     if poses is None:
@@ -111,4 +111,4 @@ def _place(scene: Scene, path: Path, values: dict[str, Any]) -> Scene:
     if len(extrinsics) != len(scene.train):
         reason = f"has {len(scene.train)} training views, but the fit has poses of {len(extrinsics)}: fit again"
         raise DataError(scene.root, "train", reason)
-    return place_cameras(scene, extrinsics)
+    return with_extrinsics(scene, extrinsics)

@@ -29,8 +29,8 @@ def disagreement(backend: Backend, device: torch.device) -> float:
         backend: works in float32 on the device.
         device: where; torch is on the CPU where it has no float64 there.
     """
-    place = device if device.type in ("cpu", "cuda") else torch.device("cpu")
-    pairs = list(zip(_render(backend, device), _render(TorchBackend(), place), strict=True))
+    reference_device = device if device.type in ("cpu", "cuda") else torch.device("cpu")
+    pairs = list(zip(_render(backend, device), _render(TorchBackend(), reference_device), strict=True))
     if backend.has_loss:
         pairs += zip(_loss(backend, device), _exact_loss(), strict=True)
     return max(_relative(value, expected) for value, expected in pairs)

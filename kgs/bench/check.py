@@ -50,19 +50,19 @@ def check(*, device: str | None = None) -> int:
     if device in _NO_TRITON:
         print(f"kgs: {_NO_TRITON[device]}")
         return 0
-    places = _devices() if device is None else [check_device(device)]
+    devices = _devices() if device is None else [check_device(device)]
     *packages, (_, machine) = versions().items()
     print(", ".join(f"{name} {version}" for name, version in packages))
     print(f"{platform.platform()}, {machine}\n")
     print(f"{'':24}{'off by':>9}{'10 000':>11}{'50 000':>11}")
     faults = 0
-    for place in places:
-        print(f"{place}: {_describe(place)}")
-        taken = backends.resolve("auto", place)
+    for each in devices:
+        print(f"{each}: {_describe(each)}")
+        taken = backends.resolve("auto", each)
         for backend in backends.BACKENDS:
-            result = _examine(backend, place) if _is_there(backend, place) else _Result(0.0, [], "")
+            result = _examine(backend, each) if _is_there(backend, each) else _Result(0.0, [], "")
             faults += bool(result.wrong)
-            print(f"  {backend.name:<22}{_row(backend, place, result, backend.name == taken)}")
+            print(f"  {backend.name:<22}{_row(backend, each, result, backend.name == taken)}")
     print(f"\noff by: from the reference in float64, image and gradients, 300 Gaussians; expected at most {BOUND:g}")
     print(f"10 000, 50 000: Gaussians; a training step at {SIZE[1]}x{SIZE[0]} without densification")
     missing = {extra: of for extra, of in _EXTRAS.items() if find_spec(of[0]) is None}

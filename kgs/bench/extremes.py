@@ -104,9 +104,9 @@ def gaussians(count: int = COUNT, seed: int = 0, **changes: Any) -> Gaussians:
     """An ordinary cloud before the camera: two to six units deep, one to five pixels wide, harmonics of degree 1."""
     generator = torch.Generator().manual_seed(seed)
     depth = _uniform(2.0, 6.0, count, generator=generator)
-    place = _uniform(-1.1, 1.1, count, 2, generator=generator) * (SIZE[1] / 2 / FOCAL)
+    xy = _uniform(-1.1, 1.1, count, 2, generator=generator) * (SIZE[1] / 2 / FOCAL)
     values: dict[str, Tensor] = {
-        "means": torch.cat([place * depth[:, None], depth[:, None]], 1),
+        "means": torch.cat([xy * depth[:, None], depth[:, None]], 1),
         "quats": torch.randn(count, 4, generator=generator, dtype=torch.float64),
         "scales": _uniform(1.0, 5.0, count, 3, generator=generator) * depth[:, None] / FOCAL,
         "opacities": _uniform(0.05, 0.9, count, generator=generator),

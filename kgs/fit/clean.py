@@ -144,8 +144,8 @@ def find_strays(
         confirmed, seen_through = _evidence(means, cameras, depths, SEEN_THROUGH / root)
         floaters |= (seen_through > 0) | _near(means, cameras, confirmed >= 2, NEAR * root)
         floaters &= confirmed < 2
-    place = model.means.device
-    return Strays(giants.to(place), needles.to(place), floaters.to(place))
+    device = model.means.device
+    return Strays(giants.to(device), needles.to(device), floaters.to(device))
 
 
 def clean(fit: Fit, strength: float = 1.0, bar: ProgressBar = silent) -> Cleaned:

@@ -37,7 +37,7 @@ _Share = Annotated[float, _Range(0, 1)]
 Backend = Literal["auto", "torch", "numba", "triton"]
 Background = Literal["black", "white"]
 
-DROP = 0.3  # final rate of dropping where few photos show the same places
+DROP = 0.3  # final rate of dropping where few photos show the same surface
 
 
 @dataclass(frozen=True)
@@ -120,9 +120,9 @@ class FitConfig:
 
     Args:
         steps: number of training steps, to which the recipe's counts are scaled. Unless given: 900 for up to three
-            views; 900 to 1400 for more, by how many photos show a place.
+            views; 900 to 1400 for more, by how many photos show a patch of surface.
         drop: final rate of DropGaussian, in [0, 1); 0 leaves the layer out. Unless given: 0.3, and less, down to 0,
-            where many photos show the same places.
+            where many photos show the same surface.
         drop_schedule: linear: the rate grows with the steps, as in the paper. constant: dropout at that rate.
         no_drop_steps: number of last steps in which no Gaussian is dropped, at most a tenth of all.
         sh_degree: degree of the view-dependent colour (spherical harmonics), 0 to 3. Unless given: 3

@@ -1,8 +1,8 @@
-"""Decides before a fit, by how many photos show the same places, its number of steps and the rate of dropping.
+"""Decides before a fit, by how many photos show the same surface, its number of steps and the rate of dropping.
 
-The more photos show a place, the longer a fit goes on to gain. Dropping is for the opposite case: a Gaussian can fit
-the few photos that show it and be wrong in all other views, and dropping makes such Gaussians rarer. But it blurs, and
-where most photos show the same places it gains nothing. Patches of surface tell which photos show what: see
+The more photos show a patch of surface, the longer a fit goes on to gain. Dropping is for the opposite case: a
+Gaussian can fit the few photos that show it and be wrong in all other views, and dropping makes such Gaussians rarer.
+But it blurs, and where most photos show the same surface it gains nothing. The patches are those of
 :class:`kgs.init_points.patches.PatchColors`.
 """
 
@@ -14,22 +14,22 @@ from kgs.init_points.patches import MIN_PATCHES, PatchColors
 from .config import DROP
 from .plan import FEW, Plan
 
-STEPS_OF_A_PHOTO = 275  # steps for each photo beyond the third that shows a place
+STEPS_OF_A_PHOTO = 275  # steps for each photo beyond the third that shows a patch of surface
 MAX_STEPS = 1400
-FEW_TOGETHER = 3.0  # photos that show two places at once: up to so many the rate is `DROP`
+FEW_TOGETHER = 3.0  # photos that show two patches at once: up to so many the rate is `DROP`
 MANY_TOGETHER = 5.0  # from so many on nothing is dropped
 
 
 class Overlap(NamedTuple):
-    """How many photos show the same places.
+    """How many photos show the same patches of surface.
 
     Args:
-        photos_per_place: how many show a patch and agree on its depth, in the mean over the patches.
-        photos_per_pair: how many show both of two patches, in the mean over all pairs of patches.
+        views_per_patch: how many show a patch and agree on its depth, in the mean over the patches.
+        views_per_pair: how many show both of two patches, in the mean over all pairs of patches.
     """
 
-    photos_per_place: float
-    photos_per_pair: float
+    views_per_patch: float
+    views_per_pair: float
 
     @classmethod
     def of(cls, patches: PatchColors) -> Self:
@@ -58,19 +58,19 @@ def decide_by_overlap(plan: Plan, points: InitialPoints) -> Plan:
         usual = {"steps": plan.schedule.steps, "drop": DROP}
         return plan.decided({name: usual[name] for name in is_open}, {})
     overlap = Overlap.of(patches)
-    chosen = {"steps": steps_for(overlap.photos_per_place), "drop": drop_rate_for(overlap.photos_per_pair)}
+    chosen = {"steps": steps_for(overlap.views_per_patch), "drop": drop_rate_for(overlap.views_per_pair)}
     entries = {name: chosen[name] for name in is_open}
     numbers = {name: round(number, 2) for name, number in overlap._asdict().items()}
     return plan.decided(entries, {"overlap": {**numbers, "patches": len(patches), **entries}})
 
 
-def steps_for(photos_per_place: float) -> int:
-    """The number of steps where so many photos show a place, a multiple of 50; of three as in fits to three."""
-    steps = FEW.steps + STEPS_OF_A_PHOTO * (photos_per_place - 3)
+def steps_for(views_per_patch: float) -> int:
+    """The number of steps where so many photos show a patch, a multiple of 50; of three as in fits to three."""
+    steps = FEW.steps + STEPS_OF_A_PHOTO * (views_per_patch - 3)
     return min(max(50 * round(steps / 50), FEW.steps), MAX_STEPS)
 
 
-def drop_rate_for(photos_per_pair: float) -> float:
-    """The final rate of dropping where so many photos show two places at once, to two decimals."""
-    share = (MANY_TOGETHER - photos_per_pair) / (MANY_TOGETHER - FEW_TOGETHER)
+def drop_rate_for(views_per_pair: float) -> float:
+    """The final rate of dropping where so many photos show two patches at once, to two decimals."""
+    share = (MANY_TOGETHER - views_per_pair) / (MANY_TOGETHER - FEW_TOGETHER)
     return round(DROP * min(max(share, 0.0), 1.0), 2)

@@ -36,7 +36,7 @@ class StepDefaults(NamedTuple):
 
 
 FEW = StepDefaults(900, 0.9925)  # of a fit to so few training views
-MANY = StepDefaults(1100, 0.995)  # of a fit to more, where nothing tells how many of them show each place
+MANY = StepDefaults(1100, 0.995)  # of a fit to more, where nothing tells how many of them show each patch
 FADING_STEPS = 1000  # up to so many the defaults of few views are used: in longer fits too much would fade
 
 
@@ -88,7 +88,7 @@ def make_plan(scene: Scene, config: FitConfig) -> Plan:
 def with_step_defaults(config: FitConfig, views: int) -> FitConfig:
     """The configuration with the numbers for so many training views, where it leaves them open.
 
-    The number of steps stays open for more than three views: how many of them show each place decides.
+    The number of steps stays open for more than three views: how many of them show each patch decides.
     """
     few = views <= FEW_VIEWS
     steps = config.steps or (FEW.steps if few else None)

@@ -81,7 +81,7 @@ class MovingPoses:
         motion.grad = None
         motion.zero_()
         self._fix_gauge()
-        return place_cameras(scene, self.extrinsics)
+        return with_extrinsics(scene, self.extrinsics)
 
     def moved(self) -> dict[str, float]:
         """How far the cameras moved: mean and maximum, rotations in degrees, shifts as shares of the median depth."""
@@ -110,14 +110,14 @@ class MovingPoses:
         turn = (left @ right).mT  # rotation of the world
         centers = camera_centers(now)
         wanted = camera_centers(self.given)
-        spreads = [(places - places.mean(dim=0)).norm() for places in (centers, wanted)]
+        spreads = [(points - points.mean(dim=0)).norm() for points in (centers, wanted)]
         scale = spreads[1] / spreads[0] if float(min(spreads)) > 1e-9 * self.depth else 1.0
         now[:, :3, :3] @= turn.mT
         centers = scale * (centers - centers.mean(dim=0)) @ turn.mT + wanted.mean(dim=0)
         now[:, :3, 3] = -(now[:, :3, :3] @ centers[..., None])[..., 0]
 
 
-def place_cameras(scene: Scene, extrinsics: Tensor) -> Scene:
+def with_extrinsics(scene: Scene, extrinsics: Tensor) -> Scene:
     """The scene with training cameras at other poses, `(V, 4, 4)`."""
     cameras = scene.train.cameras
     poses = extrinsics.to(cameras.extrinsics)

@@ -114,7 +114,7 @@ def left_out(decisions: dict[str, Any]) -> str:
         parts.append(f"harmonics ({why})")
     overlap = decisions.get("overlap")
     if overlap and overlap.get("drop") == 0:
-        parts.append(f"dropping (two places are shown together by {overlap['photos_per_pair']:.1f} photos)")
+        parts.append(f"dropping (two patches of surface are shown together by {overlap['views_per_pair']:.1f} photos)")
     if gaussians and gaussians["kept"] < gaussians["fitted"]:
         share = 1 - gaussians["kept"] / gaussians["fitted"]
         parts.append(f"{100 * share:.0f} % of the Gaussians (next to no contribution to a training view)")

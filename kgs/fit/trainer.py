@@ -35,7 +35,7 @@ from .exposure import with_exposure
 from .fit import Fit
 from .haze import FADE, veils
 from .plan import Plan, make_plan
-from .poses import decayed, place_cameras
+from .poses import decayed, with_extrinsics
 from .state import TrainState, check_saved, fingerprint, state_errors
 from .targets import Target, background_of, targets
 
@@ -104,7 +104,7 @@ class Trainer:
             absgrad=config.recipe.absgrad,
             backend=self.plan.backend,
         ).train()
-        self.scene = scene if state.poses is None else place_cameras(scene, state.poses.extrinsics)
+        self.scene = scene if state.poses is None else with_extrinsics(scene, state.poses.extrinsics)
         self._views = targets(scene.train, scene.background, self.plan.device)
         self._half_size = (
             targets(scene.train.downsample(2), scene.background, self.plan.device) if self.plan.schedule.coarse else []

@@ -192,7 +192,7 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
         projected[b] = dataclasses.replace(projected[b], means2d=rows - half)
         features = _features(scene, projected[b], render_mode.endswith("D"), return_normals)
         values = torch.cat(list(features.values()), 1)
-        hook = absgrad_hook(means2d, pairs.places(b)) if absgrad else None
+        hook = absgrad_hook(means2d, pairs.rows(b)) if absgrad else None
         composited.append(composite_call(CompositingCall(projected[b], values, options), backend, hook))
     transmittance = joined([x.transmittance for x in composited])
     widths = [x.shape[1] for x in features.values()]

@@ -17,13 +17,13 @@ def joined(parts: list[Tensor]) -> Tensor:
     return parts[0] if len(parts) == 1 else torch.cat(parts)
 
 
-def absgrad_hook(means2d: Tensor, places: Tensor | slice) -> Callable[[Tensor], None]:
+def absgrad_hook(means2d: Tensor, rows: Tensor | slice) -> Callable[[Tensor], None]:
     """A hook that stores absolute gradients as gsplat does: in rows of `means2d.absgrad`."""
 
     def store(absolute: Tensor) -> None:
         if not hasattr(means2d, "absgrad"):
             means2d.absgrad = torch.zeros_like(means2d)  # type: ignore[attr-defined]
-        means2d.absgrad.view(-1, 2)[places] = absolute  # type: ignore[attr-defined]
+        means2d.absgrad.view(-1, 2)[rows] = absolute  # type: ignore[attr-defined]
 
     return store
 
@@ -55,7 +55,7 @@ class Pairs:
             tensor = tensor.reshape(self.total, *tensor.shape[len(self.shape) :]).index_select(0, self.ids)
         return list(tensor.split(self.counts))
 
-    def places(self, b: int) -> Tensor | slice:
+    def rows(self, b: int) -> Tensor | slice:
         """The rows of a scene's pairs in a tensor of gsplat's layout."""
         begin = sum(self.counts[:b])
         rows = slice(begin, begin + self.counts[b])

@@ -122,12 +122,12 @@ def initial_points(
         warn(f"{message}the fit starts from {count} random points instead")
     near, far = depth_range(tracked, geometry)
     points = _random_points(geometry, count, near, far, generator)
-    places, depths = geometry.project(points)
-    inside = geometry.inside_images(places, depths, near, far)
+    projected, depths = geometry.project(points)
+    inside = geometry.inside_images(projected, depths, near, far)
     usable = views.usable
     if usable is not None:
-        inside &= _values_at(usable[:, None].float(), places)[..., 0] > 0.5
-    colors = _mean_colors(views.images, places, inside)
+        inside &= _values_at(usable[:, None].float(), projected)[..., 0] > 0.5
+    colors = _mean_colors(views.images, projected, inside)
     return InitialPoints(points.float(), colors, "random")
 
 
@@ -140,7 +140,7 @@ def _random_points(geometry: ViewGeometry, count: int, near: float, far: float, 
         view = (torch.rand(4 * count, generator=generator, dtype=torch.float32) * len(geometry)).long()
         depths = (near**3 + draws[:, 2] * (far**3 - near**3)) ** (1 / 3)
         points = geometry.unproject(draws[:, :2] * size - 0.5, depths, view)
-        # a place that k views see is drawn k times as often, so it is accepted with probability required / k
+        # a point that k views see is drawn k times as often, so it is accepted with probability required / k
         views_there = geometry.inside_images(*geometry.project(points), near, far).sum(1)
         accepted.append(points[(views_there >= required) & (draws[:, 3] * views_there < required)])
         if sum(map(len, accepted)) >= count:
@@ -156,5 +156,5 @@ def _mean_colors(images: Tensor, pixels: Tensor, visible: Tensor) -> Tensor:
 
 
 def _values_at(images: Tensor, pixels: Tensor) -> Tensor:
-    """The values `(P, V, K)` of images `(V, K, H, W)` at places `(P, V, 2)` in pixels."""
+    """The values `(P, V, K)` of images `(V, K, H, W)` at positions `(P, V, 2)` in pixels."""
     return torch.stack([interpolate(image, pixels[:, view]) for view, image in enumerate(images.cpu())], 1)

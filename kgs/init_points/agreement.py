@@ -133,9 +133,9 @@ def _rays(x: Tensor, y: Tensor) -> Tensor:
     return torch.stack([x, y, torch.ones_like(x)], 1).double()
 
 
-def _dehomogenise(places: Tensor) -> Tensor:
+def _dehomogenise(homogeneous: Tensor) -> Tensor:
     """Pixels `(P, 2)` of homogeneous ones; invalid at depth <= 0."""
-    return places[:, :2] / places[:, 2:]
+    return homogeneous[:, :2] / homogeneous[:, 2:]
 
 
 def interpolate(image: Tensor, pixels: Tensor) -> Tensor:

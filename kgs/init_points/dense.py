@@ -74,17 +74,17 @@ def dense_points(
     maps, certain = agreed_depths(views, near, far, bar, backend)
     geometry = ViewGeometry.of(views.cameras)
     parts = [_agreed(views, geometry, maps, certain, view) for view in range(len(views))]
-    points, colors, places = map(torch.cat, zip(*parts, strict=True))
+    points, colors, view_pixels = map(torch.cat, zip(*parts, strict=True))
     if count is None:
         agreed = round(pixels * len(points) / views.images[:, 0].numel())
         maximum = MAX_POINTS_FEW_VIEWS if len(views) <= FEW_VIEWS else MAX_POINTS
         count = min(max(agreed // PIXELS_OF_A_POINT, MIN_POINTS), maximum)
-    view, x, y = places.unbind(1)
+    view, x, y = view_pixels.unbind(1)
     is_sky = torch.stack([depth_map.depths for depth_map in maps])[view, y, x] > SKY * far
     chosen = torch.randperm(len(points), generator=generator)
-    chosen = chosen[_one_per_cell(places[chosen].numpy(), count)] if draw == "spread" else chosen[:count]
+    chosen = chosen[_one_per_cell(view_pixels[chosen].numpy(), count)] if draw == "spread" else chosen[:count]
     chosen = chosen[_with_less_sky(is_sky[chosen])]
-    of_view = [places[view == i, 1:] for i in range(len(views))]
+    of_view = [view_pixels[view == i, 1:] for i in range(len(views))]
     patches = patch_colors(views, geometry, maps, certain, of_view)
     return DensePoints(points[chosen].float(), colors[chosen], int((~is_sky).sum()), patches, view[chosen])
 
@@ -120,13 +120,13 @@ def _with_less_sky(is_sky: Tensor) -> Tensor:
     return rows
 
 
-def _one_per_cell(places: NDArray[np.int64], count: int) -> Tensor:
-    """The rows of the first place `(view, x, y)` in each of at most `count` square cells, as small as that allows."""
-    first = np.arange(len(places))
-    views, width, height = places.max(0, initial=0).tolist()
-    view, x, y = places.T
+def _one_per_cell(view_pixels: NDArray[np.int64], count: int) -> Tensor:
+    """The rows of the first pixel `(view, x, y)` in each of at most `count` square cells, as small as that allows."""
+    first = np.arange(len(view_pixels))
+    views, width, height = view_pixels.max(0, initial=0).tolist()
+    view, x, y = view_pixels.T
     minimum, maximum = 1.0, max(width, height) + 1.0  # limits of a cell's side in pixels, for bisection
-    while len(first) > count or (len(places) > count and maximum - minimum > 1e-3):
+    while len(first) > count or (len(view_pixels) > count and maximum - minimum > 1e-3):
         side = 0.5 * (minimum + maximum)
         shape = (views + 1, int(width / side) + 1, int(height / side) + 1)
         cells = np.ravel_multi_index((view, (x / side).astype(np.int64), (y / side).astype(np.int64)), shape)
@@ -152,5 +152,5 @@ def _agreed(
     pixels = torch.stack([columns, rows], 1)
     depths = maps[view].depths[rows, columns].double()
     points = geometry.unproject(pixels, depths, torch.full_like(rows, view))
-    places = torch.stack([torch.full_like(rows, view), columns, rows], 1)
-    return points, views.images[view].cpu()[:, rows, columns].mT, places
+    view_pixels = torch.stack([torch.full_like(rows, view), columns, rows], 1)
+    return points, views.images[view].cpu()[:, rows, columns].mT, view_pixels

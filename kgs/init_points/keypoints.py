@@ -16,7 +16,7 @@ from torch import Tensor
 class Keypoints(NamedTuple):
     """N keypoints of one image."""
 
-    places: Tensor  # `(N, 2)` float64, pixels; the first pixel's centre is (0, 0)
+    pixels: Tensor  # `(N, 2)` float64; the first pixel's centre is (0, 0)
     sizes: Tensor  # `(N,)` float64, pixels
     angles: Tensor  # `(N,)` float64, degrees
     descriptors: Tensor  # `(N, 128)` float32, of length 1

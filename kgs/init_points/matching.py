@@ -13,29 +13,29 @@ MAX_DISTANCE = 0.4  # between descriptors of length 1, for matches without a sec
 
 
 def match(
-    lines: Tensor, places: Tensor, descriptors1: Tensor, descriptors2: Tensor, backend: str = "auto"
+    lines: Tensor, pixels: Tensor, descriptors1: Tensor, descriptors2: Tensor, backend: str = "auto"
 ) -> tuple[Tensor, ...]:
     """Descriptor distances, and indices of the keypoints in the first and second view, each `(K,)`, of K matches.
 
     Args:
         lines: epipolar lines of the first view's keypoints in the second, normals of length 1, `(N, 3)`.
-        places: of the second view's keypoints in pixels, `(M, 2)`.
+        pixels: of the second view's keypoints, `(M, 2)`.
         descriptors1: of length 1, `(N, F)`.
         descriptors2: `(M, F)`.
         backend: "numba" and "auto" use kernels if possible; the matches are the same.
     """
     if not takes_kernels(backend, "matching", lines):
-        return _torch_matches(lines, places, descriptors1, descriptors2)
+        return _torch_matches(lines, pixels, descriptors1, descriptors2)
     from .matching_kernels import mutual_nearest
 
-    arrays = (lines.numpy(), places.T.contiguous().numpy(), (descriptors1.numpy(), descriptors2.numpy()))
+    arrays = (lines.numpy(), pixels.T.contiguous().numpy(), (descriptors1.numpy(), descriptors2.numpy()))
     matches = mutual_nearest(torch.get_num_threads(), *arrays, MAX_LINE_DISTANCE, MAX_RATIO, MAX_DISTANCE)
     return tuple(map(torch.from_numpy, matches))
 
 
-def _torch_matches(lines: Tensor, places: Tensor, descriptors1: Tensor, descriptors2: Tensor) -> tuple[Tensor, ...]:
+def _torch_matches(lines: Tensor, pixels: Tensor, descriptors1: Tensor, descriptors2: Tensor) -> tuple[Tensor, ...]:
     """`match` in torch."""
-    targets = convert_points_to_homogeneous(places).T
+    targets = convert_points_to_homogeneous(pixels).T
     candidates = [(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64), torch.zeros(0))]
     for start in range(0, len(lines), CHUNK):
         rows, columns = ((lines[start : start + CHUNK] @ targets).abs_() < MAX_LINE_DISTANCE).nonzero().unbind(1)
@@ -44,7 +44,7 @@ def _torch_matches(lines: Tensor, places: Tensor, descriptors1: Tensor, descript
         candidates.append((rows + start, columns, differences.square_().sum(1).sqrt_()))
     rows, columns, distances = map(torch.cat, zip(*candidates, strict=True))
     nearest1, rival1 = _nearest(distances, rows, len(lines))
-    nearest2, rival2 = _nearest(distances, columns, len(places))
+    nearest2, rival2 = _nearest(distances, columns, len(pixels))
     good = nearest1 & nearest2 & (distances < MAX_RATIO * torch.minimum(rival1, rival2)) & (distances < MAX_DISTANCE)
     return distances[good], rows[good], columns[good]
 

@@ -1,11 +1,11 @@
 """Matches of keypoints along epipolar lines, as in `kgs.init_points.matching`; only rounding differs.
 
     lines           (N, 3), of the first view's keypoints in the second, normals of length 1
-    places          (2, M), x and y of the second view's keypoints
+    pixels          (2, M), x and y of the second view's keypoints
     descriptors     (N, F) and (M, F), of both views
 
 A distance without a candidate is infinite. Each band of rows has its own results for the columns, so that no two
-threads write to the same place.
+threads write to the same element.
 """
 
 import numpy as np
@@ -17,16 +17,16 @@ BANDS = 16
 INFINITY = f32(np.inf)
 
 
-def mutual_nearest(threads, lines, places, descriptors, line_distance, ratio, max_distance):
+def mutual_nearest(threads, lines, pixels, descriptors, line_distance, ratio, max_distance):
     """Descriptor distances and indices in both views, `(K,)`, of mutual nearest neighbours that pass the ratio test."""
     n = len(lines)
-    m = places.shape[1]
+    m = pixels.shape[1]
     near1, rival1 = np.full((2, n), INFINITY)
     near2, rival2 = np.full((2, BANDS, m), INFINITY)
     match1 = np.zeros(n, np.int64)
     match2 = np.zeros((BANDS, m), np.int64)
     results = (near1, rival1, match1, near2, rival2, match2)
-    parallel_for(threads, BANDS, find_nearest, lines, places, *descriptors, f32(line_distance), *results, pieces=BANDS)
+    parallel_for(threads, BANDS, find_nearest, lines, pixels, *descriptors, f32(line_distance), *results, pieces=BANDS)
     if not m:
         return near1[:0], match1[:0], match1[:0]
     rival2 = np.partition(np.concatenate([near2, rival2]), 1, axis=0)[1]
@@ -38,12 +38,12 @@ def mutual_nearest(threads, lines, places, descriptors, line_distance, ratio, ma
 
 @jit
 def find_nearest(
-    begin, end, lines, places, descriptors1, descriptors2, line_distance, near1, rival1, match1, near2, rival2, match2
+    begin, end, lines, pixels, descriptors1, descriptors2, line_distance, near1, rival1, match1, near2, rival2, match2
 ):
     """The nearest candidate (the first of equal ones) and the second distance of each row and, by band, each column."""
     n = len(lines)
-    m = places.shape[1]
-    x, y = places[0], places[1]
+    m = pixels.shape[1]
+    x, y = pixels[0], pixels[1]
     off = np.empty(m, np.float32)
     candidates = np.empty(m, np.int32)
     for band in range(begin, end):

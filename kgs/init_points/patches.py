@@ -74,8 +74,8 @@ def _of_view(
     mean = sums(own, everywhere) / count.clamp_min(1)
     colors = mean[:, None].repeat(1, len(views), 1)
     visible = (count >= MIN_AGREED).repeat(1, len(views))
-    for other, places, agrees in agreeing_views(geometry, maps, certain, rows, columns, view):
-        difference = interpolate(images[other], places) - own
+    for other, projected, agrees in agreeing_views(geometry, maps, certain, rows, columns, view):
+        difference = interpolate(images[other], projected) - own
         shared = sums(one, agrees)
         colors[:, other] += sums(difference, agrees) / shared.clamp_min(1)
         visible[:, other] &= ((shared >= MIN_AGREED) & (shared >= 0.5 * count))[:, 0]

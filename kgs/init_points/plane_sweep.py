@@ -47,7 +47,7 @@ def sweep_depths(
     beyond infinity: an inverse depth below 0, so that infinity is not the last plane. There are at most
     `MAX_TO_INFINITY`, else farther apart. Depths are at most `FARTHEST` times `far`.
 
-    If all other views are at the place of a view, its depths are unknown and its scores -1.
+    If all other views are at the centre of a view, its depths are unknown and its scores -1.
     """
     if not 0 < near < far < math.inf:
         raise ValueError(f"near, far: expected 0 < near < far, got {near} and {far}")

@@ -21,7 +21,7 @@ MIN_JUMP = 1.5 * STEP
 # A plane may lie outside a neighbour's image. Without a score there, chance matches inside beat the true plane.
 UNSEEN = 0.3  # the score where no neighbour shows the patch; noise reaches as much
 ALONE = 0.6  # the second best score where one neighbour shows it, over that one's
-MARGIN = 1e-3  # pixels by which a place may lie outside an image: rounding of the homography
+MARGIN = 1e-3  # pixels by which a point may lie outside an image: rounding of the homography
 VARIANCE = 1e-5  # added to that of a patch, in squared grey values, so that noise on flat surfaces does not match
 
 
@@ -79,14 +79,14 @@ def _scores(image: Tensor, target: Tensor, homographies: Tensor) -> Tensor:
 
 
 def warp(image: Tensor, homography: Tensor) -> tuple[Tensor, Tensor]:
-    """The image at the places to which a homography maps pixels, and whether these lie in the image; both `(H, W)`."""
+    """The image at the points to which a homography maps pixels, and whether these lie in the image; both `(H, W)`."""
     height, width = image.shape
     last = torch.tensor([width - 1, height - 1], dtype=torch.float64)
     rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     mapped = torch.stack([columns, rows, torch.ones_like(rows)], -1).double() @ homography.mT
-    places = mapped[..., :2] / mapped[..., 2:]
-    inside = ((places >= -MARGIN) & (places <= last + MARGIN)).all(-1) & (mapped[..., 2] > 0)
-    grid = torch.where(inside[..., None], 2 * places / last - 1, 0.0)
+    points = mapped[..., :2] / mapped[..., 2:]
+    inside = ((points >= -MARGIN) & (points <= last + MARGIN)).all(-1) & (mapped[..., 2] > 0)
+    grid = torch.where(inside[..., None], 2 * points / last - 1, 0.0)
     warped = torch.nn.functional.grid_sample(
         image[None, None].double(), grid[None], padding_mode="border", align_corners=True
     )
@@ -106,7 +106,7 @@ def _moments(image: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _combine(scores: Iterator[Tensor]) -> Tensor:
-    """Three quarters of the best neighbour's score and a quarter of the second best's: others may not see the place."""
+    """Three quarters of the best neighbour's score and a quarter of the second best's: others may not see the patch."""
     best = next(scores)
     second = None
     for score in scores:

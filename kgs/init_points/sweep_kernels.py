@@ -25,7 +25,7 @@ SIDE = 2 * HALO + 1
 TILE_ROWS, TILE_COLUMNS = 32, 128  # pixels that one task compares: what it works on stays in the cache
 PATHS = 8  # that one task follows side by side
 LANES = 16  # planes that are compared at a time, and of which the paths' memory holds a multiple
-MARGIN = 1e-3  # pixels by which a place may lie outside an image: rounding of the homography
+MARGIN = 1e-3  # pixels by which a point may lie outside an image: rounding of the homography
 INFINITY = f32(np.inf)
 DIRECTIONS = [(dy, dx) for dy in (1, -1) for dx in (-1, 0, 1)] + [(0, 1), (0, -1)]  # rows and columns of a step
 
@@ -62,14 +62,14 @@ def columns_inside(turn, y, last_x, last_y, first, last):
     for k in range(5):
         if k < 4:
             axis = k // 2
-            place = turn[axis, 0], turn[axis, 1] * y + turn[axis, 2]
-            if k % 2 == 0:  # the place is at least 0
-                slope = place[0] + MARGIN * depth[0]
-                value = place[1] + MARGIN * depth[1]
+            coordinate = turn[axis, 0], turn[axis, 1] * y + turn[axis, 2]
+            if k % 2 == 0:  # the coordinate is at least 0
+                slope = coordinate[0] + MARGIN * depth[0]
+                value = coordinate[1] + MARGIN * depth[1]
             else:  # and at most the last pixel's
                 end = (last_y if axis else last_x) + MARGIN
-                slope = end * depth[0] - place[0]
-                value = end * depth[1] - place[1]
+                slope = end * depth[0] - coordinate[0]
+                value = end * depth[1] - coordinate[1]
         else:  # and in front of the camera
             slope = depth[0]
             value = depth[1] - 1e-9
@@ -84,7 +84,7 @@ def columns_inside(turn, y, last_x, last_y, first, last):
 
 @exact
 def warp_row(turn, y, other, begin, end, row, offset):
-    """Write an image at the places of columns `begin` to `end` - 1 of row y to `row`, from `offset` on; bilinear."""
+    """Write an image at the positions of columns `begin` to `end` - 1 of row y to `row`, from `offset` on; bilinear."""
     stride = np.int32(other.shape[1])
     last_x = np.float64(other.shape[1] - 2)
     last_y = np.float64(other.shape[0] - 2)

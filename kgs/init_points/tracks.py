@@ -40,19 +40,19 @@ def find_tracks(views: Views, bar: ProgressBar = silent, backend: str = "auto") 
 
     Two keypoints match if each is the other's nearest in RootSIFT among those near its epipolar line (under the given
     poses), clearly nearer than the second nearest, and near enough in itself. The best matches are joined first; one
-    that would give a track two places in one view is left out. Nothing is random: equal images give equal bits.
+    that would give a track two pixels in one view is left out. Nothing is random: equal images give equal bits.
     """
     # The cost of matching grows with the squares of both counts, so many views get fewer keypoints each.
     limit = min(max(48_000 // len(views), 1500), 12_000)
     features = [detect(views, view, limit) for view in bar(range(len(views)), "keypoints", "view")]
     projections = (views.cameras.intrinsics.double() @ views.cameras.extrinsics.double())[:, :3].cpu()
-    nodes, pixels, owners = _places([places for places, _ in features])
+    nodes, pixels, owners = _distinct_pixels([pixels for pixels, _ in features])
     links = list[tuple[float, int, int]]()
     for i, j in bar(list(combinations(range(len(views)), 2)), "matches", "pair"):
-        places1, descriptors1 = features[i]
-        places2, descriptors2 = features[j]
-        lines = _lines(places1, projections[i], projections[j])
-        distances, rows, columns = match(lines, places2.float(), descriptors1, descriptors2, backend)
+        pixels1, descriptors1 = features[i]
+        pixels2, descriptors2 = features[j]
+        lines = _lines(pixels1, projections[i], projections[j])
+        distances, rows, columns = match(lines, pixels2.float(), descriptors1, descriptors2, backend)
         links += zip(distances.tolist(), nodes[i][rows].tolist(), nodes[j][columns].tolist(), strict=True)
     tracks = _join(links, owners)
     track_pixels = torch.zeros(len(tracks), len(views), 2, dtype=torch.float64)
@@ -65,34 +65,34 @@ def find_tracks(views: Views, bar: ProgressBar = silent, backend: str = "auto") 
 
 
 def detect(views: Views, index: int, limit: int) -> tuple[Tensor, Tensor]:
-    """Places `(N, 2)` in float64 and RootSIFT descriptors `(N, 128)` of the strongest keypoints of one view."""
+    """Pixels `(N, 2)` in float64 and RootSIFT descriptors `(N, 128)` of the strongest keypoints of one view."""
     image = views.images[index].permute(1, 2, 0).cpu().numpy()
     grey = cv2.cvtColor((image.clip(0, 1) * 255).round().astype(np.uint8), cv2.COLOR_RGB2GRAY)
     usable = views.usable
     mask = None if usable is None else usable[index].cpu().numpy().astype(np.uint8)
     factor = 2 if grey.size < SMALL_IMAGE else 1
     keypoints = root_sift(grey, limit, factor, mask, nOctaveLayers=4, contrastThreshold=0.005)
-    return keypoints.places, keypoints.descriptors
+    return keypoints.pixels, keypoints.descriptors
 
 
-def _lines(places: Tensor, projection1: Tensor, projection2: Tensor) -> Tensor:
-    """The epipolar lines in the second view of places in the first, `(N, 3)` float32, with normals of length 1."""
+def _lines(pixels: Tensor, projection1: Tensor, projection2: Tensor) -> Tensor:
+    """The epipolar lines in the second view of pixels in the first, `(N, 3)` float32, with normals of length 1."""
     fundamental = fundamental_from_projections(projection1[None], projection2[None])[0]
-    lines = convert_points_to_homogeneous(places) @ fundamental.T
+    lines = convert_points_to_homogeneous(pixels) @ fundamental.T
     unit: Tensor = (lines / lines[:, :2].norm(dim=1, keepdim=True)).float()
     return unit
 
 
-def _places(places: list[Tensor]) -> tuple[list[Tensor], Tensor, list[int]]:
-    """For each view the number of each keypoint's place; then all distinct places, and their views, by number.
+def _distinct_pixels(pixels: list[Tensor]) -> tuple[list[Tensor], Tensor, list[int]]:
+    """For each view the number of each keypoint's pixel; then all distinct pixels, and their views, by number.
 
-    SIFT repeats a keypoint for each of its orientations: these share one place.
+    SIFT repeats a keypoint for each of its orientations: these share one pixel.
     """
     numbers = list[Tensor]()
     distinct = list[Tensor]()
     owners = list[int]()
-    for view, all_places in enumerate(places):
-        unique, inverse = torch.unique(all_places, dim=0, return_inverse=True)
+    for view, of_view in enumerate(pixels):
+        unique, inverse = torch.unique(of_view, dim=0, return_inverse=True)
         numbers.append(inverse + len(owners))
         distinct.append(unique)
         owners += [view] * len(unique)
@@ -100,19 +100,19 @@ def _places(places: list[Tensor]) -> tuple[list[Tensor], Tensor, list[int]]:
 
 
 def _join(links: list[tuple[float, int, int]], owners: list[int]) -> list[dict[int, int]]:
-    """Join places to tracks (union-find), nearest descriptors first; a track maps each of its views to a place."""
+    """Join nodes to tracks (union-find), nearest descriptors first; a track maps each of its views to a node."""
     parents = list(range(len(owners)))
-    tracks = [{view: place} for place, view in enumerate(owners)]
+    tracks = [{view: node} for node, view in enumerate(owners)]
 
-    def root(place: int) -> int:
-        while parents[place] != place:
-            parents[place] = parents[parents[place]]
-            place = parents[place]
-        return place
+    def root(node: int) -> int:
+        while parents[node] != node:
+            parents[node] = parents[parents[node]]
+            node = parents[node]
+        return node
 
-    for _, place1, place2 in sorted(links):
-        one = root(place1)
-        other = root(place2)
+    for _, node1, node2 in sorted(links):
+        one = root(node1)
+        other = root(node2)
         if one != other and not tracks[one].keys() & tracks[other].keys():
             parents[other] = one
             tracks[one] |= tracks[other]

@@ -112,10 +112,10 @@ def cells_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
         *group, seed = twice[0]
         raise ValueError(f"rows: expected one cell for each seed of {tuple(group)}, got two for {seed}")
     order = {name: k for k, name in enumerate([*cells.scene.unique(), *STARTS, *METHODS])}
-    places = cells[[*KEYS]].copy()
+    ranks = cells[[*KEYS]].copy()
     for key in ("scene", "start", "method"):
-        places[key] = cells[key].map(order).fillna(len(order))
-    return cells.join(results).iloc[places.sort_values([*KEYS], kind="stable").index]
+        ranks[key] = cells[key].map(order).fillna(len(order))
+    return cells.join(results).iloc[ranks.sort_values([*KEYS], kind="stable").index]
 
 
 def grouped(frame: pd.DataFrame, *keys: str) -> Iterable[tuple[Any, pd.DataFrame]]:

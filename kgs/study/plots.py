@@ -37,8 +37,8 @@ def panels(points: pd.DataFrame, styles: dict[str, tuple[str, str]] = STYLES, **
     size = (9, 0.9 + 0.2 * len(points)) if named else (3.9 * columns + 0.4, 3.2 * rows + 0.5)
     figure = Figure(size, dpi=DPI, layout="constrained")
     legend = dict[str, Any]()
-    for place, ((title,), some) in enumerate(grouped(points, "panel"), 1):
-        axis = figure.add_subplot(rows, columns, place)
+    for number, ((title,), some) in enumerate(grouped(points, "panel"), 1):
+        axis = figure.add_subplot(rows, columns, number)
         for (label, start), part in grouped(some.assign(start=some.get("start", "")), "label", "start"):
             color, marker = styles[label]
             look: dict[str, Any] = {"marker": marker, "ls": "" if scattered or named else "-", "alpha": 0.85, "ms": 5}
@@ -93,19 +93,19 @@ def _forest(frame: pd.DataFrame) -> pd.DataFrame:
 
 def _scattered(frame: pd.DataFrame, x: str) -> pd.DataFrame:
     cells = main_cells(frame, STARTS)
-    places = {
+    measures = {
         "gap": cells["train.psnr"] - cells["test.psnr"],
         "coadaptation": 1e3 * cells.coadaptation,
         "cost": cells.cpu_seconds,
     }
-    return _in_panels(cells.assign(x=places[x], y=cells["test.psnr"]).dropna(subset=["x", "y"]))
+    return _in_panels(cells.assign(x=measures[x], y=cells["test.psnr"]).dropna(subset=["x", "y"]))
 
 
 def _curves(frame: pd.DataFrame) -> pd.DataFrame:
     cells = main_cells(frame)[lambda main: main.method.isin((*MAIN, AUTO)) & (main.curve.str.len() > 0)]
     steps = cells.curve.map(lambda curve: [point["step"] for point in curve])
     psnr = cells.curve.map(lambda curve: [point["test_psnr"] for point in curve])
-    return _over_seeds(cells.assign(place=steps, x=steps, y=psnr))
+    return _over_seeds(cells.assign(bin=steps, x=steps, y=psnr))
 
 
 def _thresholds(frame: pd.DataFrame) -> pd.DataFrame:
@@ -115,16 +115,16 @@ def _thresholds(frame: pd.DataFrame) -> pd.DataFrame:
     edges = cells["thresholds.distance"].map(np.array)
     shares = 100 * over / counts.map(lambda count: np.where(count > 0, count, np.nan))
     middle = edges.map(lambda edge: (edge[1:] + edge[:-1]) / 2)
-    return _over_seeds(cells.assign(place=counts.map(lambda count: range(len(count))), x=middle, y=shares))
+    return _over_seeds(cells.assign(bin=counts.map(lambda count: range(len(count))), x=middle, y=shares))
 
 
 def _over_seeds(cells: pd.DataFrame) -> pd.DataFrame:
-    """Mean and standard deviation over the seeds, of cells with lists of "place", "x" and "y"; each place has one x."""
-    points = _in_panels(cells).explode(["place", "x", "y"]).astype({"x": float, "y": float})
-    points["x"] = points.groupby(["panel", "place"]).x.transform("mean")
+    """Mean and standard deviation over the seeds, of cells with lists of "bin", "x" and "y"; each bin has one x."""
+    points = _in_panels(cells).explode(["bin", "x", "y"]).astype({"x": float, "y": float})
+    points["x"] = points.groupby(["panel", "bin"]).x.transform("mean")
     means = {"x": ("x", "first"), "y": ("y", "mean"), "dy": ("y", "std")}
     lines = [
-        some.groupby("place").agg(**means).dropna(subset="y").fillna(0).assign(panel=panel, label=label)
+        some.groupby("bin").agg(**means).dropna(subset="y").fillna(0).assign(panel=panel, label=label)
         for (panel, label), some in grouped(points, "panel", "label")
     ]
     return pd.concat(lines) if lines else points

@@ -137,16 +137,16 @@ def strays_alone(path):
     ],
 )
 def test_mistakes_are_one_line_and_nothing_is_written(fitted, folder, tmp_path, capsys, words, said):
-    places = {"missing": tmp_path / "missing", "scene": folder, "fit": fitted, "out": tmp_path / "out"}
-    places |= {"splat": fitted / "splat.ply", "empty": tmp_path / "empty.ply", "strays": tmp_path / "strays.ply"}
+    paths = {"missing": tmp_path / "missing", "scene": folder, "fit": fitted, "out": tmp_path / "out"}
+    paths |= {"splat": fitted / "splat.ply", "empty": tmp_path / "empty.ply", "strays": tmp_path / "strays.ply"}
     strays_alone(tmp_path / "strays.ply")
     save_ply(tmp_path / "empty.ply", load_ply(tmp_path / "strays.ply").select(torch.arange(0)))
     before = sorted(os.listdir(tmp_path))
     at_fit = {path: path.stat().st_mtime_ns for path in fitted.rglob("*")}
-    given = [word.format(**places) for word in words.split()]
+    given = [word.format(**paths) for word in words.split()]
     if "-o" not in given:
         given += ["-o", str(tmp_path / "clean.ply")]
     assert run("clean", *given) == 2
-    assert said.format(**places) in one_line(capsys)
+    assert said.format(**paths) in one_line(capsys)
     assert sorted(os.listdir(tmp_path)) == before
     assert {path: path.stat().st_mtime_ns for path in fitted.rglob("*")} == at_fit

@@ -175,11 +175,11 @@ def small(tmp_path_factory):
 )
 def test_mistakes_are_one_line_and_exit_code_2(folder, small, tmp_path, capsys, words, said):
     """Those that need the scene or torch; the others are in test_cli_process.py."""
-    places = {"missing": tmp_path / "missing", "scene": folder, "small": small, "out": tmp_path / "out"}
-    places["file"] = folder / "transforms_train.json"
+    paths = {"missing": tmp_path / "missing", "scene": folder, "small": small, "out": tmp_path / "out"}
+    paths["file"] = folder / "transforms_train.json"
     before = sorted(folder.rglob("*"))
-    assert run(*(word.format(**places) for word in shlex.split(words))) == 2
-    assert said.format(**places) in one_line(capsys)
+    assert run(*(word.format(**paths) for word in shlex.split(words))) == 2
+    assert said.format(**paths) in one_line(capsys)
     assert sorted(folder.rglob("*")) == before
     assert os.listdir(tmp_path) == []  # nothing was begun
 

@@ -22,16 +22,16 @@ from kgs.app.files.film import camera_path, write_film
 from kgs.datasets.scene import Views
 
 
-def looking_at(target: Tensor, places: Tensor) -> Tensor:
-    """World-to-camera matrices of cameras at `places` that look at the target; the world's z is up."""
+def looking_at(target: Tensor, centers: Tensor) -> Tensor:
+    """World-to-camera matrices of cameras with these centres that look at the target; the world's z is up."""
     poses = []
-    for place in places.double():
-        ahead = (target - place) / (target - place).norm()
+    for center in centers.double():
+        ahead = (target - center) / (target - center).norm()
         right = torch.linalg.cross(ahead, torch.tensor([0.0, 0.0, 1.0]).double())
         right = right / right.norm()
         turn = torch.stack([right, torch.linalg.cross(ahead, right), ahead])
         pose = torch.eye(4).double()
-        pose[:3, :3], pose[:3, 3] = turn, -turn @ place
+        pose[:3, :3], pose[:3, 3] = turn, -turn @ center
         poses.append(pose)
     return torch.stack(poses)
 
@@ -39,9 +39,9 @@ def looking_at(target: Tensor, places: Tensor) -> Tensor:
 def ring(count: int, radius: float = 3.0) -> Tensor:
     """Cameras around the z axis in a scrambled order, at several heights."""
     angles = 2 * math.pi * torch.arange(count).double() / count
-    places = torch.stack([radius * angles.cos(), radius * angles.sin(), 1 + 0.3 * (3 * angles).sin()], 1)
+    ringed = torch.stack([radius * angles.cos(), radius * angles.sin(), 1 + 0.3 * (3 * angles).sin()], 1)
     order = torch.randperm(count, generator=torch.Generator().manual_seed(count))
-    return looking_at(torch.zeros(3).double(), places[order])
+    return looking_at(torch.zeros(3).double(), ringed[order])
 
 
 def facing(count: int) -> Tensor:
@@ -97,12 +97,12 @@ def test_the_path_passes_each_camera_and_is_smooth(request: Any, poses: Tensor) 
 def test_cameras_around_an_object_are_passed_on_arcs_that_look_at_it() -> None:
     poses = ring(5)
     path = camera_path(poses, evenly(100), 1.0)
-    places = centers(path)
-    radii, lengths = places.norm(dim=1), centers(poses).norm(dim=1)
+    positions = centers(path)
+    radii, lengths = positions.norm(dim=1), centers(poses).norm(dim=1)
     assert (lengths.min() - 0.05 < radii).all()  # a chord of the ring would come to 2.4
     assert (radii < lengths.max() + 0.05).all()
-    assert (-(path[:, 2, :3] * places).sum(1) / radii > 0.999).all()
-    turned = torch.atan2(places[:, 1], places[:, 0]).diff().remainder(2 * math.pi)
+    assert (-(path[:, 2, :3] * positions).sum(1) / radii > 0.999).all()
+    turned = torch.atan2(positions[:, 1], positions[:, 0]).diff().remainder(2 * math.pi)
     assert min(turned.sum(), (2 * math.pi - turned).sum()) < 2 * math.pi  # once around
 
 
@@ -110,9 +110,9 @@ def test_cameras_around_an_object_are_passed_on_arcs_that_look_at_it() -> None:
 def test_the_camera_moves_at_one_speed_between_the_ends(poses: Tensor) -> None:
     """Measured on the poses of the film: where the path does not turn back, steps are as long as each other."""
     path = film.resample_by_speed(poses, 400, 3.0)
-    places = centers(path)
+    positions = centers(path)
     unit = torch.cdist(centers(poses), centers(poses)).max() if len(poses) > 1 else 3.0
-    moves = torch.cat([places / unit, path[:, 2, :3] / math.pi], 1).diff(dim=0)
+    moves = torch.cat([positions / unit, path[:, 2, :3] / math.pi], 1).diff(dim=0)
     lengths = moves.norm(dim=1)
     ahead = moves / lengths[:, None]
     turns = (ahead[1:] * ahead[:-1]).sum(1).clamp(-1, 1).acos().rad2deg()
@@ -134,8 +134,8 @@ def test_an_even_path_takes_each_step_in_the_same_time() -> None:
     count, frames = 12, 240
     rim = 2 * math.pi * torch.arange(count).double() / count
     poses = looking_at(torch.zeros(3).double(), torch.stack([rim.cos(), rim.sin(), 0.3 * torch.ones(count)], 1))
-    places = centers(film.resample_by_speed(poses, frames, 1.0))
-    steps = torch.atan2(places[:, 1], places[:, 0]).diff().remainder(2 * math.pi)
+    positions = centers(film.resample_by_speed(poses, frames, 1.0))
+    steps = torch.atan2(positions[:, 1], positions[:, 0]).diff().remainder(2 * math.pi)
     steps = torch.minimum(steps, 2 * math.pi - steps)
     expected = 2 * math.pi / frames * (0.86 + 2 * 0.14)
     torch.testing.assert_close(steps[40:200], torch.full((160,), expected).double(), rtol=0.02, atol=0)
@@ -157,7 +157,7 @@ def test_a_single_camera_sways_and_keeps_its_target() -> None:
     assert 0.05 < moved.max() < 0.5
 
 
-def test_cameras_at_one_place_are_no_trouble() -> None:
+def test_cameras_with_one_centre_are_no_trouble() -> None:
     assert camera_path(facing(1).repeat(3, 1, 1), evenly(10), 1.0).isfinite().all()
     assert film.resample_by_speed(facing(1).repeat(3, 1, 1), 10, 1.0).isfinite().all()
 
@@ -207,7 +207,7 @@ def test_the_frames_are_the_renders(tmp_path: Path, monkeypatch: Any, suffix: st
     assert tuple(frames[0].shape[1:]) == expected
     assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(24)
     for frame, image in zip(frames, rendered, strict=True):
-        assert (frame - image).square().mean() < 2e-3  # 27 dB; another frame's bar is at another place
+        assert (frame - image).square().mean() < 2e-3  # 27 dB; another frame's bar is at other pixels
     small, photo = rendered[0][0, 0], render(views.camera(0))[0, 0, 0]  # of the first camera, in two sizes
     centre = [float((row * (torch.arange(len(row)) + 0.5)).sum() / row.sum()) / len(row) for row in (small, photo)]
     assert centre[0] == pytest.approx(centre[1], abs=1e-3)

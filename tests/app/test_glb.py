@@ -86,8 +86,8 @@ def test_values_are_those_of_the_ply_file(tmp_path: Path) -> None:
     vertex = trimesh.load(tmp_path / "a.ply").metadata["_ply_raw"]["vertex"]["data"]
     values = read(tmp_path / "a.glb")[1]
     column = {name: np.asarray(vertex[name], np.float64).ravel() for name in vertex.dtype.names}
-    places = np.stack([column[name] for name in "xyz"], 1)
-    np.testing.assert_array_equal(values["POSITION"], places)
+    means = np.stack([column[name] for name in "xyz"], 1)
+    np.testing.assert_array_equal(values["POSITION"], means)
     scales = np.exp(np.stack([column[f"scale_{i}"] for i in range(3)], 1))
     np.testing.assert_allclose(values[f"{EXTENSION}:SCALE"], scales, rtol=1e-6)
     np.testing.assert_allclose(values[f"{EXTENSION}:OPACITY"][:, 0], 1 / (1 + np.exp(-column["opacity"])), atol=1e-6)

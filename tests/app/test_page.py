@@ -60,7 +60,7 @@ class Links(HTMLParser):
         self.loaded += [str(given["href"])] if tag == "link" and "href" in given else []
 
 
-def test_a_page_loads_nothing_and_names_no_place_on_a_disk(tmp_path: Path) -> None:
+def test_a_page_loads_nothing_and_names_no_path_on_a_disk(tmp_path: Path) -> None:
     settings = {"scene": "/photos/mine/fern", "init_file": "C:\\photos\\mine\\points.ply", "steps": 3}
     report = {"note": "made from /photos/mine/a.jpg and others", "focal": 1.25, "inside": {"left out": ["b.jpg"]}}
     pictures = [Picture(NAMES[1], torch.rand(3, *SIZE), {"": torch.rand(3, *SIZE)})]
@@ -95,11 +95,11 @@ def test_the_strip_has_thumbnails_of_few_bytes(tmp_path: Path, count: int) -> No
     shown = strip_of(text)
     assert len(loaded) == len(shown) == min(count, 24)
     assert sum(map(len, loaded)) <= 100_000
-    places = [int(label.split()[1]) for _, label in shown]
-    assert [names[int(camera)] for camera, _ in shown] == [f"{place - 1:02d}.jpg" for place in places]
-    assert (places[0], places[-1]) == (1, count)
-    assert max(places[i + 1] - places[i] for i in range(len(places) - 1)) <= 2
-    assert [label.endswith(", held out") for _, label in shown] == [place <= 2 for place in places]
+    numbers = [int(label.split()[1]) for _, label in shown]
+    assert [names[int(camera)] for camera, _ in shown] == [f"{number - 1:02d}.jpg" for number in numbers]
+    assert (numbers[0], numbers[-1]) == (1, count)
+    assert max(numbers[i + 1] - numbers[i] for i in range(len(numbers) - 1)) <= 2
+    assert [label.endswith(", held out") for _, label in shown] == [number <= 2 for number in numbers]
     picture = cv2.imdecode(np.frombuffer(base64.b64decode(loaded[0].partition(",")[2]), np.uint8), cv2.IMREAD_COLOR)
     assert picture.shape[1] / picture.shape[0] == pytest.approx(1.5, abs=0.03)
     assert "Exif" in text
@@ -158,7 +158,7 @@ def test_the_citation_names_kgs_and_not_the_scene(tmp_path: Path) -> None:
 
 
 def test_it_opens_where_the_shown_run_is_best(tmp_path: Path) -> None:
-    cameras = batch(*(random_camera(*SIZE, 0, torch.float32) for _ in range(6)))  # at one place: all are in the middle
+    cameras = batch(*(random_camera(*SIZE, 0, torch.float32) for _ in range(6)))  # all are in the middle
     names = list("abcdef")
     rows = [{"name": name, "psnr": 20.0 + (name == "b"), "ssim": None, "lpips_vgg": None} for name in names]
     runs = {"": {"train": {"psnr": 20.2, "ssim": None, "lpips_vgg": None, "views": rows}, "test": None}}

@@ -38,7 +38,7 @@ CURRENT = "document.querySelector('.strip [aria-current=true]')?.dataset.camera 
 SHOW = """(index, width, height) => {
   const canvas = document.querySelector("canvas");
   Object.assign(canvas.style, { width: `${width}px`, height: `${height}px` });
-  if (index !== null) viewer.place(index);
+  if (index !== null) viewer.jumpTo(index);
   viewer.draw();
   return canvas.toDataURL();
 }"""
@@ -197,7 +197,7 @@ def test_what_the_photos_frame_shows_does_not_depend_on_the_canvas(
     left, top = (canvas[0] - width) // 2, (canvas[1] - height) // 2
     browser.run("viewer.isRoaming = true")
     for yaw, pitch in ((0, 0), (12, 0), (25, 0), (-25, 0), (0, 20)):
-        browser.run(f"viewer.place(viewer.scene.first); viewer.turn({math.radians(yaw)}, {math.radians(pitch)})")
+        browser.run(f"viewer.jumpTo(viewer.scene.first); viewer.turn({math.radians(yaw)}, {math.radians(pitch)})")
         lens = Views(cameras, torch.zeros(4, 3, *SIZE), tuple("abcd")).camera(CENTRAL)
         camera = camera_of(browser, lens)
         with torch.no_grad():
@@ -272,14 +272,14 @@ def test_roaming_ends_where_the_splat_leaves_the_stage(opened: Browser) -> None:
         return float(1 - (shown[1] - shown[0]).mean())
 
     for sign in (1, -1):
-        opened.run("viewer.place(viewer.scene.first); viewer.isRoaming = true")
+        opened.run("viewer.jumpTo(viewer.scene.first); viewer.isRoaming = true")
         minimum = min(1 / 3, covered() / 2)
         opened.run(f"for (let i = 0; i < 40; i++) viewer.turn({0.1 * sign}, 0)")
         assert covered() >= minimum - 0.01
         at_once = opened.run("viewer.eye.position")
-        opened.run(f"viewer.place(viewer.scene.first); viewer.turn({4.0 * sign}, 0)")  # one long drag ends there, too
+        opened.run(f"viewer.jumpTo(viewer.scene.first); viewer.turn({4.0 * sign}, 0)")  # one long drag ends there, too
         assert opened.run("viewer.eye.position") == pytest.approx(at_once, abs=1e-6)
-        opened.run("viewer.place(viewer.scene.first); viewer.zoom(2.5); window.start = viewer.eye.position")
+        opened.run("viewer.jumpTo(viewer.scene.first); viewer.zoom(2.5); window.start = viewer.eye.position")
         opened.run(f"viewer.turn({0.3 * sign}, 0)")  # from farther away it turns as well
         assert opened.run("viewer.eye.position !== start")
 
@@ -310,7 +310,7 @@ def test_a_drag_in_a_real_scene_shows_what_kgs_renders(
     renderer = kgs.GaussianRenderer(near_plane=near_plane).eval()
     lens = real.train.camera(browser.run("viewer.scene.first"))
     for share in (0.0, 0.1, 0.3, 0.6, -0.1, -0.3, -0.6):
-        browser.run("viewer.place(viewer.scene.first)")
+        browser.run("viewer.jumpTo(viewer.scene.first)")
         drag(browser, share)
         shown = show(browser, None, width, height)
         with torch.no_grad():
@@ -423,7 +423,7 @@ def test_the_distance_has_limits_and_a_drag_ends_a_quarter_beyond_the_cameras_un
     assert width == pytest.approx(arc["yaw"][1] - arc["yaw"][0])  # a drag across the stage
     for sign in (1, -1):
         for axis, name in enumerate(("yaw", "pitch")):
-            opened.run("viewer.place(viewer.scene.first)")
+            opened.run("viewer.jumpTo(viewer.scene.first)")
             # a drag to the right is a turn to the left
             step = [0.0, 0.0]
             step[axis] = sign * (-0.02 if axis == 0 else 0.02)
@@ -432,10 +432,10 @@ def test_the_distance_has_limits_and_a_drag_ends_a_quarter_beyond_the_cameras_un
             end = high if sign > 0 else low
             beyond = sign * (opened.run(TURNED)[axis] - end) / (high - low)
             assert 0.15 < beyond <= 0.25 + 1e-6, (sign, name)
-    opened.run("viewer.place(viewer.scene.first)")
+    opened.run("viewer.jumpTo(viewer.scene.first)")
     opened.run("viewer.turn(-1e3 * viewer.turnPerPixel(), 0)")  # one long drag stops there, too
     assert opened.run(TURNED)[0] <= arc["yaw"][1] + 0.25 * (arc["yaw"][1] - arc["yaw"][0]) + 1e-6
-    opened.run("viewer.place(viewer.scene.first); document.querySelector('.roam').click()")
+    opened.run("viewer.jumpTo(viewer.scene.first); document.querySelector('.roam').click()")
     assert opened.run("document.querySelector('.roam').getAttribute('aria-pressed')") == "true"
     opened.run("viewer.turn(-2.5, 0)")
     assert opened.run(TURNED)[0] == pytest.approx(2.5, abs=0.02)
@@ -461,7 +461,7 @@ def test_the_page_scrolls_past_a_stage_that_was_not_clicked(browser: Browser, pa
     assert browser.run("scrollY") == before
 
 
-PLACE = "JSON.stringify(viewer.eye.position)"
+POSITION = "JSON.stringify(viewer.eye.position)"
 TOUCHES = {
     "a press": "document.querySelector('.stage').dispatchEvent(new PointerEvent('pointerdown', {bubbles: true}))",
     "a key": "viewer.canvas.dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowLeft'}))",
@@ -478,9 +478,9 @@ def is_pressed(browser: Browser) -> bool:
 def is_at_rest(browser: Browser) -> bool:
     """Whether the eye stands still, once a flight to a photo had its time."""
     wait = "new Promise((done) => setTimeout(done, 1000))"
-    before = browser.run(f"{wait}.then(() => {PLACE})")
+    before = browser.run(f"{wait}.then(() => {POSITION})")
     browser.run("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
-    return bool(browser.run(PLACE) == before)
+    return bool(browser.run(POSITION) == before)
 
 
 def test_play_flies_the_tour_in_its_time_and_around_again(browser: Browser, page: Path) -> None:
@@ -500,7 +500,7 @@ def test_play_flies_the_tour_in_its_time_and_around_again(browser: Browser, page
       };
     })()"""
     browser.run(clock)
-    browser.run("viewer.place(3)")  # not one of the tour
+    browser.run("viewer.jumpTo(3)")  # not one of the tour
     browser.run("document.querySelector('.play').click()")
     assert is_pressed(browser)
     browser.run("pass(0.05)")
@@ -517,9 +517,9 @@ def test_play_flies_the_tour_in_its_time_and_around_again(browser: Browser, page
         np.testing.assert_allclose(rotation, expected["rotation"], atol=1e-5)
     browser.run("document.querySelector('.play').click()")
     assert not is_pressed(browser)
-    before = browser.run(PLACE)
+    before = browser.run(POSITION)
     browser.run("pass(1)")
-    assert browser.run(PLACE) == before
+    assert browser.run(POSITION) == before
 
 
 @pytest.mark.slow
@@ -532,8 +532,8 @@ def test_the_tour_ends_with_any_touch(browser: Browser, page: Path, touch: str) 
         if has_asked:
             browser.run("document.querySelector('.play').click()")
         assert is_pressed(browser) == has_asked
-        start = browser.run(PLACE)
-        browser.wait(f"{PLACE} !== {start!r}")
+        start = browser.run(POSITION)
+        browser.wait(f"{POSITION} !== {start!r}")
         browser.run(touch)
         assert not is_pressed(browser)
         assert is_at_rest(browser)
@@ -548,8 +548,8 @@ def test_where_less_motion_is_wanted_play_shows_pictures(opened: Browser) -> Non
     assert is_pressed(opened)
     poses = opened.run("viewer.scene.tour.poses.map((pose) => JSON.stringify(pose.position))")
     shown = opened.run("[...seen].map((eye) => JSON.stringify(JSON.parse(eye).position))")
-    places = [poses.index(position) for position in shown]
-    assert (places[1] - places[0]) % 144 == 36
+    indices = [poses.index(position) for position in shown]
+    assert (indices[1] - indices[0]) % 144 == 36
 
 
 def test_a_thumbnail_flies_to_its_camera(opened: Browser) -> None:

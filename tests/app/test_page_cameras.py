@@ -68,14 +68,14 @@ def around(*degrees: float, height: float = 0.0) -> dict[str, Any]:
     """What the viewer gets of cameras at these angles on a circle around the Gaussian, which they look at."""
     cameras = []
     for angle in map(math.radians, degrees):
-        place = MEANS[0].double() + 4.0 * torch.tensor([math.sin(angle), -height, -math.cos(angle)]).double()
-        forward = torch.nn.functional.normalize(MEANS[0].double() - place, dim=0)
+        center = MEANS[0].double() + 4.0 * torch.tensor([math.sin(angle), -height, -math.cos(angle)]).double()
+        forward = torch.nn.functional.normalize(MEANS[0].double() - center, dim=0)
         right = torch.nn.functional.normalize(
             torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]).double(), forward), dim=0
         )
         pose = torch.eye(4).double()
         pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
-        pose[:3, 3] = -pose[:3, :3] @ place
+        pose[:3, 3] = -pose[:3, :3] @ center
         cameras.append(pinhole(60, 80, (80.0, 80.0), (39.5, 29.5), 0.0, pose))
     return viewer_scene(batch(*cameras), ["a"] * len(cameras), ["training"] * len(cameras), MEANS)
 
@@ -130,9 +130,9 @@ def test_the_tour_is_the_path_of_the_film(tmp_path: Path, monkeypatch: Any, size
 
 
 def test_pyramids_are_smaller_than_the_distance_of_neighbours() -> None:
-    def pyramid(*places: float) -> float:
-        cameras = batch(*map(camera, places))
-        found: float = viewer_scene(cameras, ["a"] * len(places), ["training"] * len(places), MEANS)["pyramid"]
+    def pyramid(*centers: float) -> float:
+        cameras = batch(*map(camera, centers))
+        found: float = viewer_scene(cameras, ["a"] * len(centers), ["training"] * len(centers), MEANS)["pyramid"]
         return found
 
     assert pyramid(0.0, 0.1, 0.2) == pytest.approx(0.03)

@@ -40,7 +40,7 @@ def gaussians_of(packed: Packed, columns: dict[str, Any] | None = None) -> Gauss
     means = np.stack([columns[axis] for axis in "xyz"], 1)
     three = np.stack([columns[f"quat{axis}"] for axis in range(3)], 1)
     pairs = zip(three, columns["largest"].astype(int), strict=True)
-    quats = np.array([np.insert(row, place, np.sqrt(max(0.0, 1 - row @ row))) for row, place in pairs]).reshape(-1, 4)
+    quats = np.array([np.insert(row, index, np.sqrt(max(0.0, 1 - row @ row))) for row, index in pairs]).reshape(-1, 4)
     scales = np.exp(np.stack([columns[f"scale{axis}"] for axis in range(3)], 1))
     stored = np.stack([[columns[f"sh{k}{c}"] for c in "rgb"] for k in range((degree + 1) ** 2)])
     colors = (stored * np.abs(stored)).transpose(2, 0, 1)
@@ -48,7 +48,7 @@ def gaussians_of(packed: Packed, columns: dict[str, Any] | None = None) -> Gauss
 
 
 def nearest(of: Gaussians, among: Gaussians) -> Any:
-    """For each Gaussian the place of the one with the nearest centre: the page has an order of its own."""
+    """For each Gaussian the row of the one with the nearest centre: the page has an order of its own."""
     return torch.cdist(of.means, among.means).argmin(1)
 
 
@@ -94,20 +94,20 @@ def test_the_plain_form_has_the_values_in_their_order(sh_degree: int | None) -> 
     assert (rgb - exact.colors).abs().max() < 1e-6
 
 
-@pytest.mark.parametrize("places", [(1e8,), (2e7, -2e7), (1e12,), (3e5,)])
-def test_strays_move_nothing_else(cameras: Any, places: tuple[float, ...]) -> None:
+@pytest.mark.parametrize("distances", [(1e8,), (2e7, -2e7), (1e12,), (3e5,)])
+def test_strays_move_nothing_else(cameras: Any, distances: tuple[float, ...]) -> None:
     """Beside all cameras, and before them; the last one is too near to be a stray, and is kept."""
     exact = random_gaussians(300, 0, sh_degree=0)
     means = exact.means.clone()
-    for i, place in enumerate(places):
-        means[i] = torch.tensor([0.3, 0.2, 1.0]).double() * place
+    for i, distance in enumerate(distances):
+        means[i] = torch.tensor([0.3, 0.2, 1.0]).double() * distance
     exact = replace(exact, means=means)
     packed = pack(exact, cameras, 10**7)
     shown = gaussians_of(packed)
-    gone = 0 if max(places) < 1e6 else len(places)
+    gone = 0 if max(distances) < 1e6 else len(distances)
     assert len(shown) == 300 - gone
     assert packed.left_out == ["", "all but 1 stray Gaussian", "all but 2 stray Gaussians"][gone]
-    rest = exact[torch.arange(len(places), 300)]
+    rest = exact[torch.arange(len(distances), 300)]
     found = shown[nearest(rest, shown)]
     assert largest_shift(rest, found, cameras) < PIXEL_ERROR
 

@@ -248,13 +248,13 @@ def test_a_kill_before_files_are_moved(scene: Any, done: Path, monkeypatch: Any)
     assert folders(done) == ["test"]
 
 
-@pytest.mark.parametrize(("root", "is_placed"), [(".", True), ("/photos", False)])
+@pytest.mark.parametrize(("root", "is_published"), [(".", True), ("/photos", False)])
 def test_cameras_that_waited_for_a_fit_come_with_it(
-    scene: Any, done: Path, monkeypatch: Any, root: str, is_placed: bool
+    scene: Any, done: Path, monkeypatch: Any, root: str, is_published: bool
 ) -> None:
     """After a kill, too: a fit never shows itself beside the cameras of another one."""
     photos = begin(done, "photos")
-    scene = replace(scene, root=photos if is_placed else Path("/photos"))
+    scene = replace(scene, root=photos if is_published else Path("/photos"))
     (photos / "photos.json").write_text("{}")
     enter(photos, "photos")
     with monkeypatch.context() as patch, suppress(KeyboardInterrupt):
@@ -263,8 +263,8 @@ def test_cameras_that_waited_for_a_fit_come_with_it(
     assert not (done / "photos.json").exists()
     load_fit(done)
     assert seed_of(done) == 1
-    assert (done / "photos.json").exists() == is_placed
-    assert unpublished(done, "photos") == ([] if is_placed else [photos])
+    assert (done / "photos.json").exists() == is_published
+    assert unpublished(done, "photos") == ([] if is_published else [photos])
     fit(scene, CONFIG, done)
     assert unpublished(done, "photos") == []  # no fit waits for them any more
 

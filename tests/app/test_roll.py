@@ -42,9 +42,9 @@ def test_a_small_angle_tilts_the_scene_within_the_frame() -> None:
     assert turned.images.shape == straight.images.shape
     point = torch.tensor([[0.3, 0.1, 4.0]], dtype=torch.float64)
 
-    def place(each: Views) -> torch.Tensor:
+    def from_centre(each: Views) -> torch.Tensor:
         pixel = each.cameras.project(point)[0]
         return pixel - each.cameras.intrinsics[0, :2, 2]
 
-    angles = [torch.atan2(y, x) for x, y in (place(straight), place(turned))]  # y points down: clockwise
+    angles = [torch.atan2(y, x) for x, y in (from_centre(straight), from_centre(turned))]  # y points down: clockwise
     assert float((angles[1] - angles[0]).rad2deg()) == pytest.approx(10, abs=1e-6)

@@ -193,8 +193,8 @@ def distorted(image: np.ndarray, strength: float) -> np.ndarray:
     straight = shown
     for _ in range(30):
         straight = shown / (1 + strength * np.sum(straight**2, axis=-1, keepdims=True))
-    places = (straight * focal + center).astype(np.float32)
-    return cv2.remap(image, places[..., 0], places[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    pixels = (straight * focal + center).astype(np.float32)
+    return cv2.remap(image, pixels[..., 0], pixels[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
 
 
 @pytest.mark.slow

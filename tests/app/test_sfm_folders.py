@@ -32,9 +32,9 @@ def refused(capsys):
     """Runs `kgs fit` on a folder that is refused; the message. Nothing half-made is left behind."""
 
     def run(folder, *parts, out=None, code=2, kept=False, options=()):
-        place = out or folder.parent / "out"
-        assert command("fit", folder, "-o", place, *options) == code
-        assert kept or not [path.name for path in place.glob("*photos*")]
+        results = out or folder.parent / "out"
+        assert command("fit", folder, "-o", results, *options) == code
+        assert kept or not [path.name for path in results.glob("*photos*")]
         text = capsys.readouterr().err
         assert "Traceback" not in text
         for part in parts:
@@ -374,21 +374,21 @@ def test_new_cameras_wait_beside_the_fit_of_the_former_ones(folder, found):
     out = folder.parent / "out"
     waiting = out / "unfinished-1"
 
-    def placed():
-        """How many photos the cameras in their place are of."""
+    def published():
+        """How many photos the published cameras are of."""
         return (out / "sparse" / "0" / "cameras.bin").read_bytes()[0], len(list((out / "images").iterdir()))
 
     assert pose_photos(write_planes(folder), out, wait=True)["folder"] == str(out)
-    assert placed() == (3, 3)
+    assert published() == (3, 3)
     (out / "checkpoint.safetensors").write_bytes(b"of a fit")
     save(folder, planes()[:1, 20:], ["IMG_4.png"])
     for reused in (False, True):
         report = pose_photos(folder, out, wait=True)
         assert (report["reused"], report["folder"]) == (reused, str(waiting))
         assert len(report["photos"]) == 4
-        assert placed() == (3, 3)
+        assert published() == (3, 3)
     publish(waiting, out, all_former=True)
-    assert placed() == (4, 4)
+    assert published() == (4, 4)
     assert not waiting.exists()
     (folder / "IMG_4.png").unlink()
     assert pose_photos(folder, out, wait=True)["folder"] == str(waiting)
@@ -397,7 +397,7 @@ def test_new_cameras_wait_beside_the_fit_of_the_former_ones(folder, found):
     assert waiting.exists()  # a fit of them may wait, too
     (folder / "IMG_4.png").unlink()
     assert pose_photos(folder, out)["folder"] == str(out)
-    assert placed() == (3, 3)
+    assert published() == (3, 3)
     assert not waiting.exists()
     assert found == [3, 4, 3]
 

@@ -81,7 +81,7 @@ def test_photos_without_cameras_that_can_be_trusted(first, second, left, said):
     assert all(said in why for why in found.values())
 
 
-def test_the_gap_is_beside_the_photo_that_was_not_placed():
+def test_the_gap_is_beside_the_photo_that_was_not_registered():
     assert gap("f", NAMES[:5], PAIRS) == ("e", "f")
     assert gap("a", NAMES[1:], PAIRS) == ("a", "b")
     assert gap("c", ["a", "b", "d"], {("a", "c"): 20}) == ("a", "c")  # most matches
@@ -147,7 +147,7 @@ def test_of_a_photo_of_another_shape_the_middle_is_taken(tmp_path):
     assert photos[5].focal == pytest.approx(photos[4].focal)
 
 
-def test_a_wide_photo_beside_others_is_placed(tmp_path):
+def test_a_wide_photo_beside_others_is_registered(tmp_path):
     """A third of its height is missing: the cameras are those of the whole photos."""
     pytest.importorskip("pycolmap")
     whole = list(planes())
@@ -185,7 +185,7 @@ def test_a_zoomed_photo_gets_a_lens_of_its_own(tmp_path):
     assert max(map(float, angles)) < 0.5
 
 
-def test_the_others_are_placed_as_if_it_were_not_there(tmp_path):
+def test_the_others_are_registered_as_if_it_were_not_there(tmp_path):
     """Three photos with one of another place beside them have the cameras of the three."""
     pytest.importorskip("pycolmap")
     blocks = np.random.default_rng(0).integers(0, 255, (45, 60, 3), dtype=np.uint8)

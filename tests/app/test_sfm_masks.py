@@ -26,13 +26,13 @@ def test_nothing_is_matched_where_a_mask_is_black(tmp_path):
         cv2.imwrite(str(photos / "masks" / name), left_is_black())
     pose_photos(photos, tmp_path / "out")
     model = pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")
-    places = {
+    keypoints = {
         image.name: np.array([point.xy for point in image.points2D if point.has_point3D()])
         for image in model.images.values()
     }
     for name in NAMES[:2]:
-        assert places[name][:, 0].min() >= 39
-    assert places[NAMES[2]][:, 0].min() < 39
+        assert keypoints[name][:, 0].min() >= 39
+    assert keypoints[NAMES[2]][:, 0].min() < 39
     valid = load_scene(tmp_path / "out", hold_out=0).train.valid_mask
     assert valid is not None
     assert valid.float().mean((1, 2)).tolist() == pytest.approx([5 / 6, 5 / 6, 1.0], abs=0.02)

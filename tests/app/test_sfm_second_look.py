@@ -33,19 +33,19 @@ def look(monkeypatch):
     def look(found, other, photos, tries):
         calls = []
 
-        def solve(*place, **options):
-            calls.append({"seed": place[3], **options})
+        def solve(*arguments, **options):
+            calls.append({"seed": arguments[3], **options})
             return tries[len(calls) - 1] if len(calls) <= len(tries) else None
 
         monkeypatch.setattr(second_look, "solve", solve)
         monkeypatch.setattr(second_look, "verified", lambda database, names: MATCHES)
-        place = Path("matches.db"), Path("images"), Path("work"), 5, NAMES, ()
-        return look_again(*place, found, other, set(photos)), calls
+        arguments = Path("matches.db"), Path("images"), Path("work"), 5, NAMES, ()
+        return look_again(*arguments, found, other, set(photos)), calls
 
     return look
 
 
-def test_other_first_pairs_until_all_photos_are_placed(look):
+def test_other_first_pairs_until_all_photos_are_registered(look):
     whole = cameras(points=60)
     best, calls = look(cameras("abc", points=2), cameras(), "bde", [None, cameras("abcd"), whole])
     assert best is whole
@@ -53,7 +53,7 @@ def test_other_first_pairs_until_all_photos_are_placed(look):
     assert pairs == sorted(pairs, key=MATCHES.__getitem__, reverse=True)
     assert all({"b.png", "d.png", "e.png"} & set(pair) for pair in pairs)
     assert len({call["seed"] for call in calls} | {5}) == 4
-    assert [call["min_placed"] for call in calls] == [1, 1, 5]  # a try has to place more than the best so far
+    assert [call["min_registered"] for call in calls] == [1, 1, 5]  # a try has to register more than the best so far
 
 
 def test_tries_are_few_and_change_nothing_where_they_find_no_more(look):
@@ -71,15 +71,15 @@ def test_what_a_solver_sees_itself_decides_where_the_two_differ(look):
     assert [call for call in calls if "first_pair" in call] == calls[:4]
 
 
-def test_a_photo_is_placed_by_own_points_beside_the_cameras_of_the_others(look):
+def test_a_photo_is_registered_by_own_points_beside_the_cameras_of_the_others(look):
     other = cameras()
     whole = cameras(points=70)
     best, calls = look(cameras("abcd", d=20), other, "ef", [None, None, None, None, whole])
     assert best is whole
     start = calls[-1]["start"]
-    assert set(start.rotations) == {"a", "b", "c"}  # neither those to place nor the one with few points
+    assert set(start.rotations) == {"a", "b", "c"}  # neither those to register nor the one with few points
     assert start.reconstruction is other.reconstruction
-    assert calls[-1]["min_placed"] == 4
+    assert calls[-1]["min_registered"] == 4
     _, calls = look(cameras("ab"), cameras("bcdef"), "acdef", [])
     assert not any("start" in call for call in calls)  # one camera holds nothing
 
@@ -127,7 +127,7 @@ def test_the_whole_set_first_and_then_those_that_failed_look_again(monkeypatch):
             assert held == []
 
 
-def test_a_solver_whose_first_pair_leads_nowhere_places_all_photos(tmp_path, monkeypatch):
+def test_a_solver_whose_first_pair_leads_nowhere_registers_all_photos(tmp_path, monkeypatch):
     pytest.importorskip("pycolmap")
     map_once = mapping._run_mapper
 
@@ -142,7 +142,7 @@ def test_a_solver_whose_first_pair_leads_nowhere_places_all_photos(tmp_path, mon
 
 
 @pytest.mark.slow
-def test_six_photos_of_a_glossy_table_are_placed(tmp_path, kgs_data):
+def test_six_photos_of_a_glossy_table_are_registered(tmp_path, kgs_data):
     """Where the second solver begins with a pair from which its model collapses to three points."""
     pytest.importorskip("pycolmap")
     folder = kgs_data / "photos" / "headphones"

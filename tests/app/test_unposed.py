@@ -33,11 +33,11 @@ def folder(truth, tmp_path):
     """A folder of unposed photos; `folder(4)` has the first four."""
 
     def made(count):
-        place = tmp_path / f"photos{count}"
-        place.mkdir()
+        folder = tmp_path / f"photos{count}"
+        folder.mkdir()
         for i in range(count):
-            write_png(place / f"IMG_{i}.png", truth.images[i])
-        return place
+            write_png(folder / f"IMG_{i}.png", truth.images[i])
+        return folder
 
     return made
 
@@ -134,8 +134,8 @@ def test_all_photos_are_trained_on_unless_some_are_held_out(folder, tmp_path):
     }
     held_out = protocol["test"]
     assert held_out
-    places = np.array(list(cameras.values()))
-    along = (places - places.mean(0)) @ np.linalg.svd(places - places.mean(0))[2][0]
+    centers = np.array(list(cameras.values()))
+    along = (centers - centers.mean(0)) @ np.linalg.svd(centers - centers.mean(0))[2][0]
     ends = [list(cameras)[int(i)] for i in (along.argmin(), along.argmax())]
     assert not {*held_out} & {*ends}
 

@@ -81,7 +81,7 @@ def layers_of_a_chunk(seed, n):
 
 @nb.njit
 def strips_and_alphas(layers, n, threshold, pixels, strips, alphas):
-    kernels.place_pixels(pixels)
+    kernels.fill_pixels(pixels)
     kernels.find_strips(layers, n, np.float32(np.log2(threshold)), strips)
     for k in range(n):
         for p in range(0, kernels.P, WIDTH):

@@ -112,9 +112,9 @@ def test_many_chunks_hold_each_gaussian_once(tmp_path: Path, n: int) -> None:
     save_compressed_ply(tmp_path / "a.ply", model)
     found = decode(tmp_path / "a.ply")
     true = parameters(model)
-    _, places = cKDTree(true["means"]).query(found["means"])
-    assert sorted(places) == list(range(n))
-    true = {name: array[places] for name, array in true.items()}
+    _, rows = cKDTree(true["means"]).query(found["means"])
+    assert sorted(rows) == list(range(n))
+    true = {name: array[rows] for name, array in true.items()}
     for start in range(0, n, 256):
         part = slice(start, start + 256)
         check_within({k: v[part] for k, v in found.items()}, {k: v[part] for k, v in true.items()})
@@ -197,8 +197,8 @@ def test_errors_of_harmonics_below_a_step_cancel_among_neighbours(tmp_path: Path
         model.sh_rest.mul_(0.003)
     save_compressed_ply(tmp_path / "a.ply", model)
     found = decode(tmp_path / "a.ply")
-    _, places = cKDTree(model.means.detach().numpy()).query(found["means"])
-    off = found["sh_rest"] - model.sh_rest.detach().numpy()[places]
+    _, rows = cKDTree(model.means.detach().numpy()).query(found["means"])
+    off = found["sh_rest"] - model.sh_rest.detach().numpy()[rows]
     for start in range(0, 4000, 50):
         assert np.abs(off[start : start + 50].mean(0)).max() < 8 / 255 / 50 * 1.001
     assert np.sqrt((off.mean((1, 2)) ** 2).mean()) < 0.005  # in one Gaussian: 0.0023 of random signs, 0.0157 of equal
@@ -265,13 +265,13 @@ def test_the_reader_of_these_tests_reads_what_gsplat_writes(tmp_path: Path) -> N
     save_compressed_ply(tmp_path / "ours.ply", model)
     theirs = decode(tmp_path / "theirs.ply")
     ours = decode(tmp_path / "ours.ply")
-    _, places = cKDTree(ours["means"]).query(theirs["means"])
-    assert sorted(places) == list(range(200))
+    _, rows = cKDTree(ours["means"]).query(theirs["means"])
+    assert sorted(rows) == list(range(200))
     for name in ("means", "log_scales", "opacities", "sh_dc"):
-        off = np.abs(theirs[name] - ours[name][places])
+        off = np.abs(theirs[name] - ours[name][rows])
         assert off.max() < 1 / 250, name  # a step, where float32 rounds to the other side of a tie
         assert (off > 1e-5).mean() < 0.01, name
-    assert (angles(theirs["quats"], ours["quats"][places]) < ANGLE).all()
-    np.testing.assert_allclose(theirs["sh_rest"], ours["sh_rest"][places], atol=20 / 255)
+    assert (angles(theirs["quats"], ours["quats"][rows]) < ANGLE).all()
+    np.testing.assert_allclose(theirs["sh_rest"], ours["sh_rest"][rows], atol=20 / 255)
     lines = [header(tmp_path / name)[0] for name in ("theirs.ply", "ours.ply")]
     assert lines[0] == lines[1]

@@ -25,7 +25,7 @@ from kgs.model import GaussianModel
 
 
 def rig(centres, rotations):
-    """World-to-camera matrices of cameras at these places; the rows of a rotation are the camera's axes."""
+    """World-to-camera matrices with these centres; the rows of a rotation are the camera's axes."""
     extrinsics = torch.eye(4, dtype=torch.float64).repeat(len(centres), 1, 1)
     extrinsics[:, :3, :3] = rotations
     extrinsics[:, :3, 3] = -(rotations @ centres[..., None])[..., 0]
@@ -33,7 +33,7 @@ def rig(centres, rotations):
 
 
 def looking(centres, target):
-    """Rotations of upright cameras at places in the plane y = 0 that look at a point of it; y points down."""
+    """Rotations of upright cameras with centres in the plane y = 0 that look at a point of it; y points down."""
     z = torch.nn.functional.normalize(target - centres, dim=1)
     y = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64).expand_as(z)
     return torch.stack([torch.linalg.cross(y, z), y, z], 1)
@@ -137,7 +137,7 @@ def test_scales_follow_the_unit_of_the_points(unit):
     assert torch.allclose(scaled, at_one + math.log(unit), atol=1e-4)
 
 
-def test_scales_do_not_depend_on_the_place_of_the_cloud():
+def test_scales_do_not_depend_on_the_position_of_the_cloud():
     points, colors = cloud(dtype=torch.float64)
     shifted = points + torch.tensor([1e6, -2e6, 3e6], dtype=torch.float64)
     here, there = (GaussianModel.from_points(x, colors).log_scales for x in (points, shifted))
@@ -154,15 +154,15 @@ def test_coinciding_points_get_a_small_finite_scale(copies):
 
 
 @pytest.mark.parametrize("copies", [4, 5, 9])
-def test_where_every_point_occurs_often_spacing_is_that_of_the_places(copies):
+def test_where_every_point_occurs_often_spacing_is_that_of_the_distinct_points(copies):
     points, _ = cloud()
     torch.testing.assert_close(log_spacing(points.repeat(copies, 1)), log_spacing(points).repeat(copies))
 
 
-@pytest.mark.parametrize("places", [2, 3, 4])
-def test_few_places_with_many_points_each(places):
-    corners = torch.tensor([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 4.0, 0.0], [0.0, 0.0, 9.0]])[:places]
-    distances = torch.cdist(corners, corners).square().sum(1) / min(3, places - 1)
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_few_distinct_points_that_occur_often(count):
+    corners = torch.tensor([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 4.0, 0.0], [0.0, 0.0, 9.0]])[:count]
+    distances = torch.cdist(corners, corners).square().sum(1) / min(3, count - 1)
     expected = 0.5 * distances.double().log()
     torch.testing.assert_close(log_spacing(corners.repeat(6, 1)), expected.repeat(6))
 

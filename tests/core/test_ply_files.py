@@ -83,9 +83,9 @@ def test_other_elements_are_skipped(tmp_path, order):
     assert load_ply(tmp_path / "a.ply").means.tolist() == [[0, 1, 2], [0, 1, 2]]
 
 
-@pytest.mark.parametrize("place", ["element vertex", "property float x", "end_header"])
-def test_comments_may_stand_anywhere(tmp_path, place):
-    data = handmade(FLOATS, [ROW]).replace(place.encode(), f"comment kgs sh_degree 0\n{place}".encode(), 1)
+@pytest.mark.parametrize("line", ["element vertex", "property float x", "end_header"])
+def test_comments_may_stand_anywhere(tmp_path, line):
+    data = handmade(FLOATS, [ROW]).replace(line.encode(), f"comment kgs sh_degree 0\n{line}".encode(), 1)
     (tmp_path / "a.ply").write_bytes(data)
     assert load_ply(tmp_path / "a.ply").means.tolist() == [[0, 1, 2]]
 

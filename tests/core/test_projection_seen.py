@@ -41,12 +41,12 @@ def test_the_list_is_everything_in_front_that_would_be_drawn_at_opacity_two():
 
 def test_footprints_count_to_the_outer_edge_of_the_border_pixels():
     reach = REACH * math.sqrt(0.3) + 0.5
-    places = []
+    pixels = []
     for off in (-0.01, 0.01):
         far = reach + off
-        places += [(-far, 20), (WIDTH - 1 + far, 20), (30, -far), (30, HEIGHT - 1 + far)]
+        pixels += [(-far, 20), (WIDTH - 1 + far, 20), (30, -far), (30, HEIGHT - 1 + far)]
     camera = pinhole(HEIGHT, WIDTH, 1.0, (0.0, 0.0))
-    means = torch.cat([torch.tensor(places), torch.ones(8, 1)], 1).double()
+    means = torch.cat([torch.tensor(pixels), torch.ones(8, 1)], 1).double()
     quats, scales = torch.eye(4)[:1].expand(8, 4).double(), torch.full((8, 3), 1e-9).double()
     got = project(Gaussians(means, quats, scales, torch.full((8,), 0.5).double(), means), camera)
     assert got.gaussian_ids.tolist() == [0, 1, 2, 3]

@@ -325,13 +325,13 @@ def covariances(gaussians):
 
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
-@pytest.mark.parametrize("place", [(0, 1), (0, 0), (1, 1), (2, 2)])
-def test_a_covariance_that_is_not_finite_is_left_out_and_its_gradient_is_0(value, place):
+@pytest.mark.parametrize("index", [(0, 1), (0, 0), (1, 1), (2, 2)])
+def test_a_covariance_that_is_not_finite_is_left_out_and_its_gradient_is_0(value, index):
     gaussians, cameras = scene(dtype=torch.float32)
     covars = covariances(gaussians)
     rest = torch.arange(60) != 7
     expected = call(gaussians[rest], cameras, covars=covars[rest], quats=None, scales=None)[0]
-    covars[7][place] = value
+    covars[7][index] = value
     covars.requires_grad_()
     renders = call(gaussians, cameras, covars=covars, quats=None, scales=None)[0]
     assert torch.allclose(renders, expected, atol=1e-5)

@@ -69,9 +69,9 @@ def compare(values, bound=1e-5, packed=False, **options):
     for name, value in wanted.items():
         assert (found[name] - value).abs().max() <= 2 * bound * value.abs().max(), name
     if not packed:
-        by_place = expected["means2d"].grad
-        wrong = (meta["means2d"].grad - by_place) * expected["lies"][..., None]
-        assert wrong.abs().max() <= 2 * bound * by_place.abs().max()
+        gradient = expected["means2d"].grad
+        wrong = (meta["means2d"].grad - gradient) * expected["lies"][..., None]
+        assert wrong.abs().max() <= 2 * bound * gradient.abs().max()
     return true, own, meta
 
 

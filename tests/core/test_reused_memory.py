@@ -14,7 +14,7 @@ from kgs._support.memory import array, empty
 LARGE = (1000, 100)
 
 
-def place(values):
+def address(values):
     return values.ctypes.data
 
 
@@ -25,20 +25,20 @@ def nothing_is_free(monkeypatch):
 
 def test_memory_of_an_array_that_is_gone_is_used_again():
     first = array(LARGE)
-    where = place(first)
+    where = address(first)
     del first
-    assert place(array((900, 100))) == where
+    assert address(array((900, 100))) == where
 
 
 @pytest.mark.parametrize("keep", ["view", "tensor", "part of a tensor"])
 def test_memory_that_is_still_seen_is_not_used_again(keep):
     first = array(LARGE)
-    where = place(first)
+    where = address(first)
     kept = {"view": first[10:], "tensor": torch.from_numpy(first), "part of a tensor": torch.from_numpy(first)[:, 3]}[
         keep
     ]
     del first
-    assert place(array(LARGE)) != where
+    assert address(array(LARGE)) != where
     del kept
 
 
@@ -49,7 +49,7 @@ def test_arrays_have_the_shape_and_begin_at_a_cache_line(shape, dtype):
     values = array(shape, dtype)
     assert values.shape == np.empty(shape, dtype).shape
     assert values.dtype == dtype
-    assert values.nbytes < 2**16 or place(values) % 64 == 0
+    assert values.nbytes < 2**16 or address(values) % 64 == 0
     values[...] = 1
 
 

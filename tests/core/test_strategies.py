@@ -32,9 +32,9 @@ def gaussians(n=40, dtype=torch.float64):
         return torch.rand(*shape, generator=generator, dtype=torch.float64)
 
     depths = 3 + uniform(n)
-    places = (uniform(n, 2) - 0.5) * torch.tensor([0.4, 0.3]) * depths[:, None]
+    xy = (uniform(n, 2) - 0.5) * torch.tensor([0.4, 0.3]) * depths[:, None]
     values = {
-        "means": torch.cat([places, depths[:, None]], 1),
+        "means": torch.cat([xy, depths[:, None]], 1),
         "scales": torch.log(0.02 + 0.1 * uniform(n, 3)),
         "quats": uniform(n, 4) - 0.5,
         "opacities": 4 * uniform(n) - 2,

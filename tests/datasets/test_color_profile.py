@@ -175,7 +175,7 @@ def test_the_index_may_be_bytes(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_image(path) * 255, to_srgb(patches(), ADOBE_TO_SRGB, 563 / 256), atol=0.1)
 
 
-P3_PLACES = {318: (0.3127, 0.329), 319: (0.68, 0.32, 0.265, 0.69, 0.15, 0.06)}
+P3_CHROMATICITIES = {318: (0.3127, 0.329), 319: (0.68, 0.32, 0.265, 0.69, 0.15, 0.06)}
 
 
 @pytest.mark.parametrize(
@@ -185,7 +185,7 @@ P3_PLACES = {318: (0.3127, 0.329), 319: (0.68, 0.32, 0.265, 0.69, 0.15, 0.06)}
         (exif(1, "R03"), None, None, False),
         (exif(2), ADOBE_TO_SRGB, 563 / 256, False),
         (exif(None, "R03"), ADOBE_TO_SRGB, 563 / 256, False),
-        (exif(65535, more=P3_PLACES), P3_TO_SRGB, None, False),
+        (exif(65535, more=P3_CHROMATICITIES), P3_TO_SRGB, None, False),
         (exif(65535, more={318: (0.0, 0.0), 319: (0.1,) * 6}), None, None, True),
         (exif(65535, more={318: 7.0, 319: 1.0}), None, None, True),
         (exif(65535), None, None, True),
@@ -224,21 +224,21 @@ def gamma_chunk(value: float) -> tuple[bytes, bytes]:
     return b"gAMA", struct.pack(">I", round(value * 100_000))
 
 
-def places_chunk(*places: int) -> tuple[bytes, bytes]:
-    return b"cHRM", struct.pack(">8I", *D65, *places)
+def chromaticities_chunk(*chromaticities: int) -> tuple[bytes, bytes]:
+    return b"cHRM", struct.pack(">8I", *D65, *chromaticities)
 
 
-SRGB_PLACES = places_chunk(64000, 33000, 30000, 60000, 15000, 6000)
-ADOBE_PLACES = places_chunk(64000, 33000, 21000, 71000, 15000, 6000)
+SRGB_CHROMATICITIES = chromaticities_chunk(64000, 33000, 30000, 60000, 15000, 6000)
+ADOBE_CHROMATICITIES = chromaticities_chunk(64000, 33000, 21000, 71000, 15000, 6000)
 P3_CHUNK = (b"iCCP", b"P3\0\0" + zlib.compress(p3_profile()))
 CHUNKS = {
     "gamma of sRGB": ([gamma_chunk(0.45455)], None, None),
-    "gamma and primaries of sRGB": ([gamma_chunk(0.45455), SRGB_PLACES], None, None),
+    "gamma and primaries of sRGB": ([gamma_chunk(0.45455), SRGB_CHROMATICITIES], None, None),
     "linear": ([gamma_chunk(1.0)], None, 1.0),
     "another gamma": ([gamma_chunk(1 / 1.8)], None, 1.8),
-    "Adobe RGB": ([gamma_chunk(256 / 563), ADOBE_PLACES], ADOBE_TO_SRGB, 563 / 256),
-    "primaries alone": ([places_chunk(68000, 32000, 26500, 69000, 15000, 6000)], P3_TO_SRGB, None),
-    "sRGB before gamma": ([(b"sRGB", b"\0"), gamma_chunk(1.0), ADOBE_PLACES], None, None),
+    "Adobe RGB": ([gamma_chunk(256 / 563), ADOBE_CHROMATICITIES], ADOBE_TO_SRGB, 563 / 256),
+    "primaries alone": ([chromaticities_chunk(68000, 32000, 26500, 69000, 15000, 6000)], P3_TO_SRGB, None),
+    "sRGB before gamma": ([(b"sRGB", b"\0"), gamma_chunk(1.0), ADOBE_CHROMATICITIES], None, None),
     "profile before gamma": ([P3_CHUNK, gamma_chunk(1.0)], P3_TO_SRGB, None),
     "cICP of P3": ([(b"cICP", bytes([12, 13, 0, 1]))], P3_TO_SRGB, None),
     "cICP of BT.2020": ([(b"cICP", bytes([9, 13, 0, 1]))], BT2020_TO_SRGB, None),

@@ -83,12 +83,12 @@ def test_focal_lengths_that_no_lens_has(name: str, value: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("place", "value"),
+    ("index", "value"),
     [((0, 0), float("nan")), ((0, 3), float("inf")), ((0, 3), 1e16), ((2, 2), -1.0)]
-    + [(place, scale) for place in ((1, 1), (range(3), range(3))) for scale in (0.99, 1.01, 2.0)],
+    + [(index, scale) for index in ((1, 1), (range(3), range(3))) for scale in (0.99, 1.01, 2.0)],
 )
-def test_poses_that_no_camera_has(place: tuple[Any, Any], value: float) -> None:
+def test_poses_that_no_camera_has(index: tuple[Any, Any], value: float) -> None:
     pose = torch.eye(4, dtype=torch.float64)
-    pose[place] = value
+    pose[index] = value
     with pytest.raises(DataError, match=r"photo\.png"):
         Frame(SOURCE, "photo.png", ImageFile(SOURCE), LENS, pose)

@@ -92,7 +92,7 @@ def test_reducing_takes_the_mean_and_scales_each_axis_by_its_exact_ratio() -> No
     expected = image.reshape(HEIGHT // 3, 3, WIDTH // 2, 2, 3).mean(axis=(1, 3))
     np.testing.assert_allclose(small, expected, atol=1e-6)
     assert (result.width, result.height, result.fx, result.fy) == (60, 30, 50.0, 98.0 / 3)
-    # a point keeps its place: (u + 1/2) / W is the same in both images
+    # a point keeps its position: (u + 1/2) / W is the same in both images
     x, y = result.matrix()[:2, 2]
     np.testing.assert_allclose([(x + 0.5) / 60, (y + 0.5) / 30], [58 / WIDTH, 47 / HEIGHT])
 
@@ -115,7 +115,7 @@ def rays(pinhole: Intrinsics) -> np.ndarray:
     ("k1", "fisheye"), [(-0.2, False), (0.0, False), (0.1, False), (0.3, False), (0.1, True), (0.6, True)]
 )
 def test_no_pixel_of_an_undistorted_image_is_blank_or_smeared(k1: float, fisheye: bool) -> None:
-    """Every pixel of the result looks at a place inside the photo; barrel lenses keep their focal length."""
+    """Every pixel of the result looks at a point inside the photo; barrel lenses keep their focal length."""
     given = replace(lens(k1, 0.0, 0.0, 0.0), fisheye=fisheye)
     _, pinhole = undistort(blob(60.0, 45.0), given)
     project = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints

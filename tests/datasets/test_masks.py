@@ -334,9 +334,9 @@ def half() -> Views:
 
 
 def test_no_keypoint_lies_where_no_pixel_counts(half: Views) -> None:
-    places, _ = detect(half, 0, 1000)
-    assert len(places) > 50
-    assert float(places[:, 0].min()) >= half.images.shape[-1] // 2 - 1
+    pixels, _ = detect(half, 0, 1000)
+    assert len(pixels) > 50
+    assert float(pixels[:, 0].min()) >= half.images.shape[-1] // 2 - 1
 
 
 def test_the_loss_has_no_gradient_where_no_pixel_counts(half: Views) -> None:

@@ -25,7 +25,7 @@ def views(height, width):
 
 
 @pytest.mark.parametrize("size", [(16, 20), (15, 21)])
-def test_a_point_projects_to_the_same_place_of_a_halved_picture(size):
+def test_a_point_projects_to_the_same_position_in_a_halved_picture(size):
     full = views(*size)
     half = full.downsample(2)
     assert half.images.shape == (2, 3, size[0] // 2, size[1] // 2)

@@ -73,14 +73,14 @@ def test_one_view_and_all_views() -> None:
 @pytest.mark.parametrize("count", [3, 4, 5, 6, 9, 10, 17])
 def test_photos_at_the_ends_of_the_row_are_never_held_out(count: int, every: int) -> None:
     rng = np.random.default_rng(count)
-    places = rng.permutation(count)  # names in another order than the cameras
-    angles = np.linspace(-1, 1, count)[places]
+    ranks = rng.permutation(count)  # names in another order than the cameras
+    angles = np.linspace(-1, 1, count)[ranks]
     centers = np.stack([np.sin(angles), 0.1 * rng.uniform(-1, 1, count), np.cos(angles)], 1)
     names = [f"IMG_{i:02}.jpg" for i in range(count)]
     train, test = split_between_ends(names, centers, every=every)
     assert sorted([*train, *test]) == list(range(count))
     assert 1 <= len(test) <= max(1, -(-count // every))
-    assert not {*test} & {int(places.argmin()), int(places.argmax())}
+    assert not {*test} & {int(ranks.argmin()), int(ranks.argmax())}
     assert [*train] == sorted(train)
     assert len(split_between_ends(names, centers, 2, every)[0]) == 2
     assert len(held_out_between_ends(count - 2, every)) == len(test), "it follows from the number of photos alone"

@@ -111,10 +111,10 @@ def test_the_sky_shines_and_the_ground_is_shaded():
     frame = made.frames[0]
     emitted = made.textures[0](((middles - frame[:3, 3]) @ frame[:3, :3]).astype(np.float32))
     np.testing.assert_allclose(made.shade(middles, rows), emitted.clip(0, 1), atol=1e-6)
-    places = np.array([[0.0, 0.0, 1.75], [0.0, 0.0, -4.0]])  # under the table, and in the open
+    points = np.array([[0.0, 0.0, 1.75], [0.0, 0.0, -4.0]])  # under the table, and in the open
     frame = made.frames[1]
-    albedo = made.textures[1](((places - frame[:3, 3]) @ frame[:3, :3]).astype(np.float32))
-    under, in_the_open = made.shade(places, np.full(2, made.unlit)) / albedo
+    albedo = made.textures[1](((points - frame[:3, 3]) @ frame[:3, :3]).astype(np.float32))
+    under, in_the_open = made.shade(points, np.full(2, made.unlit)) / albedo
     assert (under < 0.8 * in_the_open).all()
 
 

@@ -103,9 +103,9 @@ def test_light_is_lamberts_and_a_screen_shades_what_is_behind_it():
     up = np.array([0.0, -1.0, 0.0])
     screen = trimesh.creation.box((1.0, 0.02, 1.0)).apply_translation([0.0, -0.5, 0.0])
     lights = daylight(np.asarray(screen.triangles), up, up)
-    places = np.array([[0.0, 0.0, 0.0], [0.0, -0.52, 0.0], [3.0, 0.0, 0.0], [0.0, -0.52, 0.0]])
+    points = np.array([[0.0, 0.0, 0.0], [0.0, -0.52, 0.0], [3.0, 0.0, 0.0], [0.0, -0.52, 0.0]])
     normals = np.array([up, up, up, [1.0, 0.0, 0.0]])
-    under, above, beside, upright = received(lights, places, normals)
+    under, above, beside, upright = received(lights, points, normals)
     np.testing.assert_allclose(above, beside, rtol=1e-5)  # both see the whole sky
     np.testing.assert_allclose(above - 0.16, [1.24, 1.22, 1.18], rtol=0.02)  # the sun's colour and the sky's
     assert (under < 0.5 * above).all()

@@ -47,7 +47,7 @@ def wall(scene, *, depth=0.5, gray=0.9, opacity=0.0):
     [(0.5, 0.9, [1600]), (0.5, 0.1, []), (1.5, 0.9, [])],
     ids=["bright before the wall", "dark before the wall", "behind the wall"],
 )
-def test_only_what_brightens_dark_places_from_before_the_surface_is_a_veil(scene, depth, gray, found):
+def test_only_what_brightens_dark_pixels_from_before_the_surface_is_a_veil(scene, depth, gray, found):
     assert not veils(wall(scene, depth=depth, gray=gray)).any()
     assert veils(wall(scene, depth=depth, gray=gray, opacity=0.2)).nonzero()[:, 0].tolist() == found
 

@@ -1,4 +1,4 @@
-"""Steps and dropping follow how many photos show each place, and are never decided where they are given."""
+"""Steps and dropping follow how many photos show each patch of surface, and are never decided where they are given."""
 
 import json
 from dataclasses import replace
@@ -43,7 +43,7 @@ def points_seen_by(photos: float, views: int = 8, count: int = 1000):
     return InitialPoints(cloud, torch.full((50, 3), 0.5), "dense", patches)
 
 
-def test_steps_rise_and_the_rate_falls_with_the_photos_that_show_the_same_places():
+def test_steps_rise_and_the_rate_falls_with_the_photos_that_show_the_same_patches():
     photos = torch.linspace(1.0, 12.0, 111).tolist()
     steps = [steps_for(n) for n in photos]
     rates = [drop_rate_for(n) for n in photos]
@@ -59,18 +59,18 @@ def test_photos_that_show_two_patches_are_counted_over_all_pairs():
     patches = PatchColors(torch.zeros(40, 6, 3), visible, torch.zeros(40, 6, 3))
     pairs = [int((one & other).sum()) for one in visible for other in visible]
     overlap = Overlap.of(patches)
-    assert overlap.photos_per_pair == pytest.approx(sum(pairs) / len(pairs))
-    assert overlap.photos_per_place == pytest.approx(float(visible.sum(1).double().mean()))
+    assert overlap.views_per_pair == pytest.approx(sum(pairs) / len(pairs))
+    assert overlap.views_per_patch == pytest.approx(float(visible.sum(1).double().mean()))
 
 
 @pytest.mark.parametrize("photos", [3.0, 5.0, 8.0])
 def test_what_is_open_is_decided_by_the_patches(scene, photos):
     plan = decide_by_overlap(make_plan(scene, OPEN), points_seen_by(photos))
-    together = Overlap.of(points_seen_by(photos).patches).photos_per_pair
+    together = Overlap.of(points_seen_by(photos).patches).views_per_pair
     chosen = {"steps": steps_for(photos), "drop": drop_rate_for(together)}
     assert plan.config == replace(make_plan(scene, OPEN).config, **chosen)
     assert plan.schedule.steps == chosen["steps"]
-    numbers = {"photos_per_place": pytest.approx(photos), "photos_per_pair": pytest.approx(together, abs=0.01)}
+    numbers = {"views_per_patch": pytest.approx(photos), "views_per_pair": pytest.approx(together, abs=0.01)}
     found = {"overlap": {**numbers, "patches": 1000, **chosen}}
     assert json.loads(json.dumps(plan.decisions)) == found
     assert ("dropping" in left_out(plan.decisions)) == (chosen["drop"] == 0)
@@ -112,10 +112,10 @@ def test_a_fit_goes_on_as_it_was_decided(scene, tmp_path):
 
 
 def test_a_whole_fit_says_what_it_decided():
-    """Eight photos of the room, all of which show most places."""
+    """Eight photos of the room, all of which show most patches."""
     large = synthetic_scene("room", train_views=8, test_views=1, size=(96, 128))
     fit = fit_scene(large, FitConfig(steps=4, evaluations=1))
     found = fit.history["decisions"]["overlap"]
-    assert 3 <= found["photos_per_pair"] <= found["photos_per_place"] <= 8
-    assert found["drop"] == fit.settings.drop == pytest.approx(drop_rate_for(found["photos_per_pair"]), abs=0.01)
+    assert 3 <= found["views_per_pair"] <= found["views_per_patch"] <= 8
+    assert found["drop"] == fit.settings.drop == pytest.approx(drop_rate_for(found["views_per_pair"]), abs=0.01)
     assert "steps" not in found

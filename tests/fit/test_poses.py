@@ -20,7 +20,7 @@ from kgs.datasets import load_scene, synthetic_scene
 from kgs.fit import FitConfig, Trainer
 from kgs.fit.checkpoint import load_checkpoint, save_checkpoint
 from kgs.fit.plan import make_plan
-from kgs.fit.poses import REACH, MovingPoses, decayed, place_cameras
+from kgs.fit.poses import REACH, MovingPoses, decayed, with_extrinsics
 from kgs.fit.run import choose_points
 from kgs.geometry import camera_centers
 
@@ -71,7 +71,7 @@ def pulled(poses, scene, targets, steps):
 def test_cameras_follow_their_gradient(room):
     given = room.train.cameras.extrinsics
     wrong = turned(given, 0.15, seed=1)  # within reach
-    scene = place_cameras(room, wrong)
+    scene = with_extrinsics(room, wrong)
     poses = MovingPoses(scene.train.cameras.extrinsics, steps=600, depth=DEPTH)
     scene = pulled(poses, scene, given, 600)
     assert degrees_apart(wrong, given) > 0.15
@@ -118,7 +118,7 @@ def test_no_step_without_a_finite_gradient(room, slope):
 @pytest.mark.slow
 def test_a_fit_turns_wrong_cameras_back():
     scene = synthetic_scene(train_views=3, test_views=1, size=(48, 64))
-    wrong = place_cameras(scene, turned(scene.train.cameras.extrinsics, 0.7, seed=5))
+    wrong = with_extrinsics(scene, turned(scene.train.cameras.extrinsics, 0.7, seed=5))
     config = FitConfig(steps=150, seed=1, sh_degree=0, init_points=1500, max_gaussians=2000, evaluations=1)
     points = choose_points(wrong, config)
     fits = [
@@ -172,9 +172,9 @@ def test_files_are_about_the_moved_cameras(refined):
     given = load_scene(root).train.cameras.extrinsics
     assert 0 < metrics["poses"]["degrees"] <= metrics["poses"]["max_degrees"]
     listed = json.loads((out / "cameras.json").read_text())[: len(given)]
-    places = torch.tensor([entry["position"] for entry in listed]) - scene.offset
-    torch.testing.assert_close(places, camera_centers(scene.train.cameras.extrinsics), rtol=0, atol=1e-6)
-    assert not torch.allclose(places, camera_centers(given), rtol=0, atol=1e-6)
+    centers = torch.tensor([entry["position"] for entry in listed]) - scene.offset
+    torch.testing.assert_close(centers, camera_centers(scene.train.cameras.extrinsics), rtol=0, atol=1e-6)
+    assert not torch.allclose(centers, camera_centers(given), rtol=0, atol=1e-6)
     assert "moved the training cameras by" in (out / "index.html").read_text()
     evaluate(out)
     again = json.loads((out / "metrics.json").read_text())

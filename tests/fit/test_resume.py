@@ -119,9 +119,9 @@ def test_a_mistake_in_kgs_or_of_the_caller_is_no_fault_of_the_checkpoint(scene, 
     def broken(*_, **__):
         raise TypeError("unsupported operand")
 
-    for place in ("kgs.fit.trainer.make_plan", "kgs.fit.state.TrainState._assemble", "kgs.fit.trainer.targets"):
+    for function in ("kgs.fit.trainer.make_plan", "kgs.fit.state.TrainState._assemble", "kgs.fit.trainer.targets"):
         with monkeypatch.context() as patch:
-            patch.setattr(place, broken)
+            patch.setattr(function, broken)
             with pytest.raises(TypeError, match="unsupported operand"):
                 Trainer.resume(scene, CONFIG, saved)
 

@@ -36,8 +36,8 @@ def made_up(patches=1200, views=VIEWS, size=0.0, noise=0.0, exposure=0.0, spread
         return torch.randn(*shape, generator=rng)
 
     centers = torch.nn.functional.normalize(spread * normal(views, 3) + torch.tensor([0.0, 0.0, -1.0]), dim=1)
-    places = 0.2 * normal(patches, 1, 3)
-    directions = torch.nn.functional.normalize(places - centers, dim=-1)
+    points = 0.2 * normal(patches, 1, 3)
+    directions = torch.nn.functional.normalize(points - centers, dim=-1)
     basis = harmonics_basis(directions.reshape(-1, 3), 3)[:, 1:].reshape(patches, views, 15)
     coefficients = size * math.sqrt(4 * math.pi / 15) * normal(patches, 15, 3)
     colors = 0.2 + 0.6 * torch.rand(patches, 1, 3, generator=rng) + basis @ coefficients

@@ -113,7 +113,7 @@ def damaged_text(draw: DrawFn, data: bytes) -> bytes:
 def damaged_json(draw: DrawFn, data: bytes) -> bytes:
     """A value replaced, a key or an element removed, doubled or added; or the bytes of the text damaged."""
     tree = json.loads(data)
-    holder, key = draw(st.sampled_from(list(_places(tree))))
+    holder, key = draw(st.sampled_from(list(_slots(tree))))
     token = draw(st.sampled_from(_JSON))
     kinds = ("bytes", "mark", "replace", "replace", "replace", "remove", "double", "add", "scale")
     match draw(st.sampled_from(kinds)):
@@ -139,7 +139,7 @@ def damaged_json(draw: DrawFn, data: bytes) -> bytes:
     return text.encode("utf-8", "surrogatepass")
 
 
-def _places(tree: Any) -> list[tuple[Any, Any]]:
+def _slots(tree: Any) -> list[tuple[Any, Any]]:
     """Every container with every key or index in it."""
     found, waiting = [], [tree]
     while waiting:

@@ -63,7 +63,7 @@ def test_small_files_that_ask_for_much_memory_are_refused(
     assert read_within_bounds(read, path) == "refused"
 
 
-PLACES = [
+KEYS = [
     (write, key, in_a_frame)
     for write in (write_blender, write_nerfstudio)
     for key in GEOMETRIC_KEYS
@@ -71,7 +71,7 @@ PLACES = [
 ]
 
 
-@pytest.mark.parametrize(("write", "key", "in_a_frame"), PLACES)
+@pytest.mark.parametrize(("write", "key", "in_a_frame"), KEYS)
 def test_a_key_is_used_refused_or_noted(
     tmp_path: Path, write: Callable[[Path], None], key: str, in_a_frame: bool
 ) -> None:

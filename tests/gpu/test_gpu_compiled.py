@@ -47,8 +47,8 @@ def test_the_oldest_version_that_torch_brings_draws_the_same(tmp_path):
         "assert triton.__version__ == '3.2.0', triton.__version__\n"
         "print(disagreement(GpuBackend(), torch.device('cpu')))"
     )
-    places = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
-    environment = os.environ | {"TRITON_INTERPRET": "1", "PYTHONPATH": places}
+    paths = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    environment = os.environ | {"TRITON_INTERPRET": "1", "PYTHONPATH": paths}
     done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     assert float(done.stdout) <= 5e-6

@@ -57,7 +57,7 @@ def test_a_row_slice_is_freed_before_the_next_is_made(monkeypatch):
     def composite_rows(self, *arguments):
         assert not [1 for reference in held if reference() is not None]
         lists = real(self, *arguments)
-        held[:] = [weakref.ref(x) for x in (lists.entries, lists.places, lists.offsets, lists.starts)]
+        held[:] = [weakref.ref(x) for x in (lists.entries, lists.slots, lists.offsets, lists.starts)]
         return lists
 
     monkeypatch.setattr(compositing.GpuCompositor, "_composite_rows", composite_rows)

@@ -36,14 +36,14 @@ def decode(path: Path) -> dict[str, NDArray[np.float64]]:
             case words:
                 assert words[0] == "comment"
     tables: dict[str, list[dict[str, float]]] = {}
-    place = 0
+    offset = 0
     for name, count, properties in elements:
         layout = "<" + "".join({"float": "f", "uint": "I", "uchar": "B"}[kind] for _, kind in properties)
         size = sum(_SIZES[kind] for _, kind in properties)
-        rows = [struct.unpack_from(layout, body, place + size * i) for i in range(count)]
+        rows = [struct.unpack_from(layout, body, offset + size * i) for i in range(count)]
         tables[name] = [dict(zip([each for each, _ in properties], row, strict=True)) for row in rows]
-        place += size * count
-    assert place == len(body)
+        offset += size * count
+    assert offset == len(body)
     assert len(tables["chunk"]) == math.ceil(len(tables["vertex"]) / 256)
     found: dict[str, list[Any]] = {key: [] for key in ("means", "quats", "log_scales", "opacities", "sh_dc", "sh_rest")}
     for i, vertex in enumerate(tables["vertex"]):

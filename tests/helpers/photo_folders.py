@@ -41,7 +41,7 @@ def write_photos(folder: Path, images: np.ndarray, film: int = 0) -> Path:
 
 
 def close(degrees: float) -> np.ndarray:
-    """The same planes from places so far apart: half a degree fits any focal length, one most."""
+    """The same planes from centres so far apart: half a degree fits any focal length, one most."""
     return planes(cameras(0.2 * degrees * CENTERS, -0.02 * degrees))
 
 

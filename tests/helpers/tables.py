@@ -39,9 +39,9 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         return
     reports = [report for group in terminalreporter.stats.values() for report in group]
     found = [p for r in reports if isinstance(r, pytest.TestReport) and r.when == "call" for p in r.user_properties]
-    for name, (place, make) in _TABLES.items():
+    for name, (subfolder, make) in _TABLES.items():
         if rows := [row for table, row in found if table == name]:
-            path = folder / place / name
+            path = folder / subfolder / name
             path.parent.mkdir(parents=True, exist_ok=True)
             rows = _of_most_trials(rows)
             write_results(path, rows, make(rows, path))

@@ -122,7 +122,7 @@ def test_random_points_have_the_colours_of_what_counts() -> None:
     colors = initial_points(shown, "random", count=500).colors
     black = (colors == 0).all(1)  # seen where no pixel counts
     assert 0.05 < float(black.float().mean()) < 0.6
-    # a place may lie between pixels that count and others
+    # a point may lie between pixels that count and others
     assert float((colors[~black] - torch.tensor([0.2, 0.4, 0.6])).abs().amax(1).median()) < 1e-6
     assert float(colors[~black].amin(0)[0]) > 0.1
 
@@ -149,7 +149,7 @@ def test_random_points_fill_the_common_frustum_evenly() -> None:
     assert float(all_three.double().mean()) == pytest.approx(expected, abs=0.01)
 
 
-def test_random_points_surround_the_place_where_orbiting_cameras_look() -> None:
+def test_random_points_surround_the_point_where_orbiting_cameras_look() -> None:
     extrinsics = torch.eye(4).repeat(6, 1, 1)
     for i in range(6):
         extrinsics[i, :3, :3] = torch.from_numpy(cv2.Rodrigues(np.array([0.0, i * np.pi / 3, 0.0]))[0])

@@ -118,10 +118,10 @@ def test_where_photos_agree_nowhere_random_points_take_over(views: Views, shown:
 
 def test_neighbours_stand_neither_too_near_nor_too_far(views: Views) -> None:
     """Cameras along a line, at 0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4 and 2 times the depth."""
-    places = torch.tensor([0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 2.0]) * 3.0
-    n = len(places)
+    centers = torch.tensor([0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 2.0]) * 3.0
+    n = len(centers)
     extrinsics = torch.eye(4).repeat(n, 1, 1)
-    extrinsics[:, 0, 3] = -places
+    extrinsics[:, 0, 3] = -centers
     first = views.camera(0)
     camera = PinholeCamera(first.intrinsics.repeat(n, 1, 1), extrinsics, first.height.repeat(n), first.width.repeat(n))
     line = ViewGeometry.of(camera)
@@ -223,11 +223,11 @@ def test_a_spread_draw_has_one_point_in_each_cell(views: Views, span: tuple[floa
 
 
 def test_a_spread_draw_follows_the_area_not_the_density() -> None:
-    """Nine tenths of the places crowd in a tenth of the width."""
+    """Nine tenths of the pixels crowd in a tenth of the width."""
     crowd = torch.rand(9000, 2, generator=generator()) * torch.tensor([10, 100])
     others = torch.rand(1000, 2, generator=generator(1)) * torch.tensor([90, 100]) + torch.tensor([10, 0])
-    places = torch.cat([torch.zeros(10_000, 1), torch.cat([crowd, others])], 1).long()
-    drawn = places[_one_per_cell(places.numpy(), 100)]
+    view_pixels = torch.cat([torch.zeros(10_000, 1), torch.cat([crowd, others])], 1).long()
+    drawn = view_pixels[_one_per_cell(view_pixels.numpy(), 100)]
     assert 80 <= len(drawn) <= 100
     assert float((drawn[:, 1] < 10).double().mean()) < 0.25
 

@@ -53,7 +53,7 @@ def test_a_splat_gives_its_colours(tmp_path: Path) -> None:
 
 
 def write_cloud(path: Path, shift: tuple[float, float, float]) -> FitConfig:
-    """A cloud about a place, and the configuration of a fit that starts from it."""
+    """A cloud about a point, and the configuration of a fit that starts from it."""
     points = np.random.default_rng(0).normal(size=(40, 3)) + np.array(shift)
     trimesh.PointCloud(points).export(path)
     return FitConfig(steps=2, init="file", init_file=path)
@@ -92,7 +92,7 @@ def test_the_origin_is_subtracted_before_rounding(tmp_path: Path) -> None:
     np.testing.assert_allclose(result.points.numpy(), local, atol=1e-5)
 
 
-def test_vertices_without_a_finite_place_are_no_points(tmp_path: Path) -> None:
+def test_vertices_without_a_finite_position_are_no_points(tmp_path: Path) -> None:
     """Colours of no points are no table, which was an IndexError."""
     trimesh.PointCloud(np.array([[0, 0, 1.0], [np.nan, 0, 0]])).export(tmp_path / "cloud.ply")
     with pytest.raises(DataError, match="finite"):

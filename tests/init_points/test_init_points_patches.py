@@ -46,9 +46,9 @@ def test_patches_have_the_colours_and_directions_of_the_wall() -> None:
     means = plain.sum(1, keepdim=True) / patches.visible.sum(1)[:, None, None]
     torch.testing.assert_close(plain[patches.visible], means.expand_as(plain)[patches.visible], atol=2e-4, rtol=0)
     to_wall = (DEPTH - GEOMETRY.centers[:, 2]) / patches.directions[..., 2]
-    places = GEOMETRY.centers + to_wall[..., None] * patches.directions
-    torch.testing.assert_close(places, places[:, :1].expand_as(places), atol=1e-5, rtol=0)
-    torch.testing.assert_close(means[:, 0, :2], (0.3 + 0.02 * places[:, 0, :2]).float(), atol=2e-4, rtol=0)
+    points = GEOMETRY.centers + to_wall[..., None] * patches.directions
+    torch.testing.assert_close(points, points[:, :1].expand_as(points), atol=1e-5, rtol=0)
+    torch.testing.assert_close(means[:, 0, :2], (0.3 + 0.02 * points[:, 0, :2]).float(), atol=2e-4, rtol=0)
 
 
 def test_only_views_that_agree_show_a_patch() -> None:

@@ -1,4 +1,4 @@
-"""Tracks and points from them: blobs at known places, closed forms, OpenCV."""
+"""Tracks and points from them: blobs at known pixels, closed forms, OpenCV."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def test_masks_leave_out_keypoints(planes: Views) -> None:
     assert float(tracks.pixels[tracks.visible][:, 0].min()) > WIDTH // 2 - 1
 
 
-def blobs(places: np.ndarray, scales: np.ndarray, size: tuple[int, int]) -> Views:
-    """Gaussian blobs at known places as two cameras see them, the second moved along x by 8 pixels of disparity."""
+def blobs(pixels: np.ndarray, scales: np.ndarray, size: tuple[int, int]) -> Views:
+    """Gaussian blobs at known pixels as two cameras see them, the second moved along x by 8 pixels of disparity."""
     width, height = size
     ys, xs = np.mgrid[:height, :width]
     image = 0.1 + 0.3 * xs / width + 0.2 * ys / height  # the ramp gives the round blobs an orientation
-    for (x, y), scale in zip(places, scales, strict=True):
+    for (x, y), scale in zip(pixels, scales, strict=True):
         image += 0.3 * np.exp(-((xs - x) ** 2 + (ys - y) ** 2) / (2 * scale**2))
     images = torch.from_numpy(np.stack([image, np.roll(image, -8, axis=1)])).float()
     centers = np.array([[0.0, 0, 0], [8.0 / focal_length(width), 0, 0]])
@@ -37,10 +37,10 @@ def blobs(places: np.ndarray, scales: np.ndarray, size: tuple[int, int]) -> View
 
 @pytest.mark.parametrize("size", [(320, 240), (520, 400)], ids=["doubled", "as it is"])
 def test_keypoints_have_integer_pixel_centres(size: tuple[int, int]) -> None:
-    places = np.array([[70.0, 60.0], [131.25, 77.5], [200.0, 101.0], [90.6, 150.3], [180.0, 170.0]])
-    tracks = find_tracks(blobs(places, np.array([3.0, 4.0, 5.0, 3.5, 6.0]), size))
+    pixels = np.array([[70.0, 60.0], [131.25, 77.5], [200.0, 101.0], [90.6, 150.3], [180.0, 170.0]])
+    tracks = find_tracks(blobs(pixels, np.array([3.0, 4.0, 5.0, 3.5, 6.0]), size))
     for view, offset in ((0, 0.0), (1, 8.0)):
-        distances = torch.cdist(tracks.pixels[:, view] + torch.tensor([offset, 0.0]), torch.from_numpy(places))
+        distances = torch.cdist(tracks.pixels[:, view] + torch.tensor([offset, 0.0]), torch.from_numpy(pixels))
         assert float(distances.amin(0).max()) < 0.08
 
 

@@ -14,20 +14,20 @@ from kgs.init_points import matching_kernels as kernels  # noqa: E402  # needs n
 
 
 def keypoints(n, m, seed=0):
-    """Lines, places, and descriptors of which some are nearly those of the other view, and some are there twice."""
+    """Lines, pixels, and descriptors of which some are nearly those of the other view, and some are there twice."""
     generator = torch.Generator().manual_seed(seed)
     angles = 0.2 * torch.rand(n, generator=generator)
     lines = torch.stack([angles.sin(), angles.cos(), -100 * torch.rand(n, generator=generator)], 1)
-    places = 100 * torch.rand(m, 2, generator=generator)
+    pixels = 100 * torch.rand(m, 2, generator=generator)
     first, second = (
         torch.nn.functional.normalize(torch.rand(k, 128, generator=generator) ** 4, p=1, dim=1).sqrt() for k in (n, m)
     )
     same = min(n, m) // 2
-    places[:same, 1] = -(lines[:same, 0] * places[:same, 0] + lines[:same, 2]) / lines[:same, 1]
+    pixels[:same, 1] = -(lines[:same, 0] * pixels[:same, 0] + lines[:same, 2]) / lines[:same, 1]
     second[:same] = first[:same] + 0.02 * torch.rand(same, 128, generator=generator)
-    second[: same // 4], places[same : same + same // 4] = second[:1], places[: same // 4]
+    second[: same // 4], pixels[same : same + same // 4] = second[:1], pixels[: same // 4]
     second[same : same + same // 4] = second[: same // 4]  # equal distances, to the bit
-    return lines, places, first, second
+    return lines, pixels, first, second
 
 
 def matches(arguments, backend):

@@ -83,7 +83,7 @@ def test_smoothed_costs_are_torchs(height, width, planes):
 
 @pytest.mark.parametrize("last_row", [[0.002, -0.003, 1.0], [-0.1, 0.0, 1.0]])
 def test_a_warped_ramp_is_a_ramp_and_empty_behind_the_camera(last_row):
-    """Bilinear interpolation does not change a + b x + c y, so the places can be read from the grey values."""
+    """Bilinear interpolation does not change a + b x + c y, so the points can be read from the grey values."""
     homography = torch.tensor([[1.1, 0.05, -2.3], [-0.04, 0.93, 1.7], last_row], dtype=torch.float64)
     rows, columns = torch.meshgrid(torch.arange(20), torch.arange(30), indexing="ij")
     ramp = 0.2 + 0.01 * columns + 0.02 * rows

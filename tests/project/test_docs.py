@@ -171,7 +171,7 @@ def test_each_folder_of_results_says_what_made_it():
     results = ROOT / "docs" / "results"
     folders = {path.name for path in results.iterdir() if path.is_dir()}
     rows = re.findall(r"^\| (\[.+) \| (.+) \|$", (results / "README.md").read_text(encoding="utf-8"), re.M)
-    assert {place for names, _ in rows for place in re.findall(r"\]\(([\w-]+)/", names)} == folders
+    assert {folder for names, _ in rows for folder in re.findall(r"\]\(([\w-]+)/", names)} == folders
     assert all("`" in command for _, command in rows)
     for script in re.findall(r"python (docs/results/\S+\.py)", " ".join(command for _, command in rows)):
         assert (ROOT / script).is_file()
@@ -232,8 +232,8 @@ LINKING = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "noteboo
 def test_its_links_lead_somewhere(path):
     missing = []
     for link in links(text_of(path)):
-        place, _, anchor = link.partition("#")
-        target = path.parent / place if place else path
+        name, _, anchor = link.partition("#")
+        target = path.parent / name if name else path
         inside = target.resolve().is_relative_to(ROOT) and target.exists()
         if not inside or (anchor and anchor not in anchors(target)):
             missing.append(link)
@@ -263,9 +263,9 @@ def test_the_readme_of_a_published_package_links_to_the_repository(tmp_path):
     after = (tmp_path / "README.md").read_text(encoding="utf-8")
     assert not links(after)
     made = re.findall(r"https://github.com/OWNER/kgs/(raw|blob)/v[\d.]+/([^)#]+)", after)
-    assert sorted(place for _, place in made) == sorted(link.partition("#")[0] for link in links(before))
-    shown = {place for kind, place in made if kind == "raw"}  # what a browser has to show as it is
-    assert shown == {place for _, place in made if place.endswith((".jpg", ".png", ".html"))} > {"docs/demo.png"}
+    assert sorted(path for _, path in made) == sorted(link.partition("#")[0] for link in links(before))
+    shown = {path for kind, path in made if kind == "raw"}  # what a browser has to show as it is
+    assert shown == {path for _, path in made if path.endswith((".jpg", ".png", ".html"))} > {"docs/demo.png"}
     assert re.sub(r"https://github.com/OWNER/kgs/(raw|blob)/v[\d.]+/", "", after) == before
 
 

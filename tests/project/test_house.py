@@ -211,15 +211,15 @@ def test_public_names_say_what_they_take_and_return(module):
 # -- words ---------------------------------------------------------------------------------------------------------
 
 
-def test_no_file_names_a_place_on_a_disk():
+def test_no_file_names_a_path_on_a_disk():
     tracked = [path for folder in (*PACKAGES, "tests", "docs", ".ci") for path in (ROOT / folder).rglob("*")]
     texts = [path for path in tracked if path.suffix in {".py", ".md", ".json", ".jsonl", ".csv", ".tex", ".html", ""}]
     texts = [path for path in [*texts, *ROOT.glob("[!.]*.*")] if path.is_file()]
-    place = re.compile(r"(?<![\w.:/<])/(?:home|root|work|tmp|Users)/\w")
+    absolute = re.compile(r"(?<![\w.:/<])/(?:home|root|work|tmp|Users)/\w")
     found = [
         (path.relative_to(ROOT).as_posix(), number)
         for path in texts
         for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1)
-        if place.search(line)
+        if absolute.search(line)
     ]
     assert not found

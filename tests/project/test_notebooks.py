@@ -132,7 +132,7 @@ CLAIMS["08_from_gsplat"] = (
 
 
 @pytest.fixture
-def workplace(tmp_path):
+def workdir(tmp_path):
     """A folder to run in, beside the measured figures as in the repository."""
     shutil.copytree(NOTEBOOKS[0].parents[1] / "docs" / "results", tmp_path / "docs" / "results")
     (tmp_path / "notebooks").mkdir()
@@ -191,19 +191,19 @@ def test_each_notebook_has_claims():
 
 @pytest.mark.filterwarnings("ignore:FigureCanvasAgg is non-interactive")
 @pytest.mark.parametrize("path", [path for path in NOTEBOOKS if path.stem in QUICK], ids=lambda path: path.stem)
-def test_it_runs_quickly(path, workplace, monkeypatch):
-    monkeypatch.chdir(workplace)
+def test_it_runs_quickly(path, workdir, monkeypatch):
+    monkeypatch.chdir(workdir)
     monkeypatch.setenv("KGS_QUICK", "1")
     monkeypatch.setattr(backend_inline, "set_matplotlib_formats", lambda *args, **kwargs: None)
     with plt.rc_context({"backend": "agg"}):
         assert run_here(path) == pictures(nbformat.read(path, as_version=4))
-    assert not list(workplace.iterdir()), "a notebook leaves files behind"
+    assert not list(workdir.iterdir()), "a notebook leaves files behind"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_it_runs_in_full(path, workplace):
-    run_in_a_kernel(path, workplace)
+def test_it_runs_in_full(path, workdir):
+    run_in_a_kernel(path, workdir)
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
@@ -219,7 +219,7 @@ def test_one_cell_near_the_top_sets_the_sizes_and_it_is_stored_as_run_from_top_t
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_it_is_small_and_names_no_place_on_a_disk(path):
+def test_it_is_small_and_names_no_path_on_a_disk(path):
     assert path.stat().st_size < 400_000
     notebook = nbformat.read(path, as_version=4)
     texts = [cell.source for cell in notebook.cells]

@@ -89,7 +89,7 @@ class Blobs(nn.Module):
     def __init__(self, drop, count=40, size=24, seed=0):
         super().__init__()
         generator = torch.Generator().manual_seed(seed)
-        self.places = nn.Parameter(size * torch.rand(count, 2, generator=generator))
+        self.means2d = nn.Parameter(size * torch.rand(count, 2, generator=generator))
         self.colors = nn.Parameter(torch.rand(count, 3, generator=generator))
         self.logits = nn.Parameter(torch.zeros(count))
         self.drop, self.size = drop, size
@@ -98,7 +98,7 @@ class Blobs(nn.Module):
         opacities = self.drop(self.logits.sigmoid())
         y, x = torch.meshgrid(torch.arange(self.size), torch.arange(self.size), indexing="ij")
         pixels = torch.stack([x, y], dim=-1).reshape(-1, 1, 2)
-        alphas = opacities * torch.exp(-(pixels - self.places - offset).square().sum(-1) / 18)
+        alphas = opacities * torch.exp(-(pixels - self.means2d - offset).square().sum(-1) / 18)
         alphas = alphas.clamp(max=0.99)
         light = torch.cumprod(torch.cat([torch.ones_like(alphas[:, :1]), 1 - alphas], dim=1), dim=1)[:, :-1]
         return ((light * alphas) @ self.colors).T.reshape(1, 3, self.size, self.size)

@@ -108,9 +108,9 @@ def test_only_pixels_that_count_are_compared():
 
 
 def test_real_scenes_are_trained_from_the_middle_and_tested_outside(tmp_path):
-    places = torch.tensor([5.0, 0.0, -1.0, 1.0, -6.0, 2.0, -2.0, 0.9])
+    centers = torch.tensor([5.0, 0.0, -1.0, 1.0, -6.0, 2.0, -2.0, 0.9])
     extrinsics = torch.eye(4).repeat(8, 1, 1)
-    extrinsics[:, 0, 3] = -places
+    extrinsics[:, 0, 3] = -centers
     views = as_views(pinholes(torch.eye(4).repeat(8, 1, 1), extrinsics, (2, 3)), torch.rand(8, 3, 2, 3))
     none = torch.zeros(0, 3)
     whole = Scene(

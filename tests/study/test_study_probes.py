@@ -20,17 +20,17 @@ from kgs.study.overfitting import BINS, coadaptation, count_over_threshold
 
 
 def spots(colors, depths, side=12):
-    """Separate opaque spots on a grid, at each place one Gaussian for each colour, at the given depths."""
+    """Separate opaque spots on a grid, at each pixel one Gaussian for each colour, at the given depths."""
     rows, columns = torch.meshgrid(torch.arange(side), torch.arange(side), indexing="ij")
-    places = torch.stack([columns, rows], -1).reshape(-1, 2) * 8.0 + 4.0 - 48.0
-    means = torch.cat([torch.cat([places / 100 * depth, torch.full((len(places), 1), depth)], 1) for depth in depths])
+    pixels = torch.stack([columns, rows], -1).reshape(-1, 2) * 8.0 + 4.0 - 48.0
+    means = torch.cat([torch.cat([pixels / 100 * depth, torch.full((len(pixels), 1), depth)], 1) for depth in depths])
     n = len(means)
     model = GaussianModel(
         means=means,
         quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(n, 1),
         log_scales=torch.full((n, 3), math.log(0.03)),
         opacity_logits=torch.full((n,), 9.0),
-        sh_dc=((torch.tensor(colors).repeat_interleave(len(places))[:, None, None].expand(n, 1, 3) - 0.5) / SH_C0),
+        sh_dc=((torch.tensor(colors).repeat_interleave(len(pixels))[:, None, None].expand(n, 1, 3) - 0.5) / SH_C0),
         sh_rest=torch.zeros(n, 0, 3),
     )
     scene = synthetic_scene(train_views=1, test_views=0, size=(96, 96))
@@ -49,7 +49,7 @@ def test_gaussians_that_repeat_each_other_are_not_coadapted():
 
 def test_the_variance_of_one_before_another():
     model, views = spots([1.0, 0.2], [2.0, 2.05])
-    # at each place both are there, or one, or none, each in one of four halves; all pairs of these by hand
+    # at each pixel both are there, or one, or none, each in one of four halves; all pairs of these by hand
     half = len(model) // 2
     states = []
     for front, behind in ((1, 1), (1, 0), (0, 1), (0, 0)):

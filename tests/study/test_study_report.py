@@ -201,9 +201,9 @@ def test_other_tables(markdown):
     fixed = psnrs(rows, "llff/fern", "fixed 0.3")
     (rate,) = lines(markdown, "Rates and schedules", "fixed 0.3")
     assert rate[5:7] == [f"{np.mean(fixed) / d:.3f} ({np.std(fixed, ddof=1) / d:.3f})" for d in (110, 31)]
-    for place, values in ((7, off), (9, dense)):
+    for column, values in ((7, off), (9, dense)):
         gains = np.subtract(fixed, values[:2])
-        assert rate[place : place + 2] == [f"{interval(gains)} (2)", interval(gains / 110, decimals=3)]
+        assert rate[column : column + 2] == [f"{interval(gains)} (2)", interval(gains / 110, decimals=3)]
     assert lines(markdown, "Selected Gaussians", "near")[0][11:] == ["17.49 / 0.582 / 0.273", "-1.73", "-3.27"]
     fern = [r["result"] for r in rows if list(r["cell"].values())[:4] == ["llff/fern", 3, "dense", "off"]]
     (cost,) = lines(markdown, "Cost, overfitting", "llff/fern, 3 views, dense", "off")

@@ -58,19 +58,19 @@ def arc_cell(cell: Cell) -> dict[str, Any]:
     angles = np.radians(cell["spacing"] * (np.arange(cell["photos"]) - (cell["photos"] - 1) / 2))
     away = np.stack([np.sin(angles), np.full_like(angles, -0.25), -np.cos(angles)], axis=1)
     truth = synthetic_views(DISTANCE * away, "orbit", size=cell.get("size", SIZE), seed=cell["world"])
-    with TemporaryDirectory(prefix="kgs-") as place:
-        folder = Path(place) / "photos"
+    with TemporaryDirectory(prefix="kgs-") as temporary:
+        folder = Path(temporary) / "photos"
         folder.mkdir()
         for name, image in zip(truth.names, truth.images, strict=True):
             write_png(folder / f"{name}.png", image)
         try:
-            report = pose_photos(folder, Path(place) / "out", say=lambda line: None)
+            report = pose_photos(folder, Path(temporary) / "out", say=lambda line: None)
         except DataError as error:
             return {"accepted": False, "why": str(error).partition("photos: ")[2].partition(". ")[0]}
-        found = load_scene(Path(place) / "out", hold_out=0).train
-    placed = [truth.names.index(Path(name).stem) for name in found.names]
+        found = load_scene(Path(temporary) / "out", hold_out=0).train
+    registered = [truth.names.index(Path(name).stem) for name in found.names]
     ours = found.cameras.extrinsics.double()
-    given = truth.cameras.extrinsics.double()[placed]
+    given = truth.cameras.extrinsics.double()[registered]
     between = [(r[:, None] @ r[None].mT) for r in (ours[:, :3, :3], given[:, :3, :3])]
     scales = torch.pdist(camera_centers(ours)) / torch.pdist(camera_centers(given))
     focal = report["focal_px"] / float(truth.cameras.fx[0]) - 1
@@ -78,7 +78,7 @@ def arc_cell(cell: Cell) -> dict[str, Any]:
         "degrees": float(degrees_between(*between).max()),
         "distances": float((scales.max() - scales.min()) / scales.mean()),
     }
-    return {"accepted": True, "placed": len(placed), "focal": focal, **errors}
+    return {"accepted": True, "registered": len(registered), "focal": focal, **errors}
 
 
 def write_arcs(rows: Sequence[Mapping[str, Any]], out: Path) -> str:

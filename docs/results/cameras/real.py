@@ -1,4 +1,4 @@
-"""Cameras of real photos, in sets of six and in whole folders: how many are placed, and how far off they are."""
+"""Cameras of real photos, in sets of six and in whole folders: how many are registered, and how far off they are."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -26,12 +26,12 @@ FOLDERS = {  # by the name of a set: where its photos are in SCENES, and where t
     "fox": ("nerfstudio/fox/images", "nerfstudio/fox"),
 }
 FEW = 6  # photos of a part of a folder
-HEADS = "placed", "degrees off", "pixels"
+HEADS = "registered", "degrees off", "pixels"
 Rotations = dict[str, NDArray[np.float64]]  # by the stems of the photos' names
 
 
 def cameras(*, out: Path, beside: tuple[Path, ...] = (), processes: int | None = None) -> int:
-    """How many of real photos are placed, and how far their cameras are from the given ones (20 minutes; can go on).
+    """How many real photos are registered, and how far their cameras are from the given ones (20 minutes; can go on).
 
     For example:
       KGS_DATA=SCENES python real.py --out cameras --processes 1
@@ -61,17 +61,17 @@ def cameras(*, out: Path, beside: tuple[Path, ...] = (), processes: int | None =
 def set_cell(cell: Cell) -> dict[str, Any]:
     """Find the cameras of every "step"-th photo of a folder from the "first" on, all of them if "photos" is 0."""
     paths = find_photos(_scenes() / FOLDERS[cell["folder"]][0])[cell["first"] :: cell["step"]]
-    with TemporaryDirectory(prefix="kgs-") as place:
-        folder = Path(place) / "photos"
+    with TemporaryDirectory(prefix="kgs-") as temporary:
+        folder = Path(temporary) / "photos"
         folder.mkdir()
         for path in paths[: cell["photos"] or None]:
             (folder / path.name).symlink_to(path.resolve())
         given = len(list(folder.iterdir()))
         try:
-            report = pose_photos(folder, Path(place) / "out", say=lambda line: None)
+            report = pose_photos(folder, Path(temporary) / "out", say=lambda line: None)
         except DataError as error:
             return {"given": given, "rotations": {}, "why": error.reason.splitlines()[0]}
-        views = load_scene(Path(place) / "out", hold_out=0).train
+        views = load_scene(Path(temporary) / "out", hold_out=0).train
     turns = {name: cv2.Rodrigues(pose[:3, :3].numpy())[0].ravel() for name, pose in _poses(views)}
     return {
         "given": given,
@@ -115,8 +115,8 @@ def _columns(result: Mapping[str, Any], known: Rotations) -> list[str]:
 
 def _known(folder: str, rows: Sequence[Mapping[str, Any]]) -> Rotations:
     """The rotations of a folder's given poses, else those that were found of all its photos together."""
-    if place := FOLDERS[folder][1]:
-        poses = _poses(load_scene(_scenes() / place, hold_out=0).train)
+    if scene := FOLDERS[folder][1]:
+        poses = _poses(load_scene(_scenes() / scene, hold_out=0).train)
         return {name: pose[:3, :3].double().numpy() for name, pose in poses}
     whole = next((row["result"] for row in rows if row["cell"]["folder"] == folder and not row["cell"]["photos"]), {})
     return {name: cv2.Rodrigues(np.array(turn))[0] for name, turn in whole.get("rotations", {}).items()}

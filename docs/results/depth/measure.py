@@ -145,11 +145,11 @@ def _displacements(geometry: ViewGeometry, view: int, depths: Tensor, truth: Ten
     rows, columns = torch.meshgrid(*map(torch.arange, depths.shape), indexing="ij")
     pixels = torch.stack([columns, rows], -1).reshape(-1, 2)
     of_view = torch.full((len(pixels),), view)
-    places = [
+    pixels = [
         geometry.project(geometry.unproject(pixels, values.reshape(-1), of_view))[0][:, nearest]
         for values in (depths, truth)
     ]
-    return (places[0] - places[1]).norm(dim=1).reshape(depths.shape)
+    return (pixels[0] - pixels[1]).norm(dim=1).reshape(depths.shape)
 
 
 def _markdown(rows: list[Row]) -> str:

@@ -139,9 +139,9 @@ def complete_pixels(points: Tensor, views: Views, truth: Tensor) -> Tensor:
     for view, exact in enumerate(truth):
         pixels, depths = (part[:, 0] for part in project_points(points, views.camera(view)))
         for offset in product(range(-REACH, REACH + 1), repeat=2):
-            places = pixels.round() + torch.tensor(offset)
-            inside = ((places >= 0) & (places < limits)).all(1) & ((places - pixels).norm(dim=1) <= REACH)
-            x, y = places[inside].long().unbind(1)
+            near = pixels.round() + torch.tensor(offset)
+            inside = ((near >= 0) & (near < limits)).all(1) & ((near - pixels).norm(dim=1) <= REACH)
+            x, y = near[inside].long().unbind(1)
             close = (depths[inside] / exact[y, x] - 1).abs() <= CLOSE
             found[view, y[close], x[close]] = True
     return found

@@ -6,8 +6,8 @@ const pause = (seconds) => new Promise((done) => setTimeout(done, 1000 * seconds
 
 export async function mkkellogg(view) {
   const { SceneRevealMode, Viewer } = await import("@mkkellogg");
-  const placed = view && { cameraUp: view.up, initialCameraPosition: view.position, initialCameraLookAt: view.target };
-  const viewer = new Viewer({ sharedMemoryForWorkers: false, sceneRevealMode: SceneRevealMode.Instant, ...placed });
+  const pose = view && { cameraUp: view.up, initialCameraPosition: view.position, initialCameraLookAt: view.target };
+  const viewer = new Viewer({ sharedMemoryForWorkers: false, sceneRevealMode: SceneRevealMode.Instant, ...pose });
   await viewer.addSplatScene(PLY, { showLoadingUI: false });
   if (view) {
     viewer.camera.fov = view.fov * DEGREES;
@@ -73,15 +73,15 @@ export const three = (view) =>
 
 export async function gsplat(view) {
   const { Camera, Loader, OrbitControls, PLYLoader, Quaternion, Scene, Vector3, WebGLRenderer } = await import("gsplat");
-  const { Matrix4, Quaternion: Turn, Vector3: Place } = await import("three");
+  const { Matrix4, Quaternion: Turn, Vector3: ThreeVector3 } = await import("three");
   const [scene, camera, renderer] = [new Scene(), new Camera(), new WebGLRenderer()];
   document.body.append(renderer.canvas);
   const controls = view ? null : new OrbitControls(camera, renderer.canvas);
   await PLYLoader.LoadAsync(PLY, scene, () => {});
   renderer.setSize(innerWidth, innerHeight);
   if (view) {
-    const ahead = new Place().fromArray(view.target).sub(new Place().fromArray(view.position)).normalize();
-    const down = new Place().fromArray(view.up).negate();
+    const ahead = new ThreeVector3().fromArray(view.target).sub(new ThreeVector3().fromArray(view.position)).normalize();
+    const down = new ThreeVector3().fromArray(view.up).negate();
     const right = down.clone().cross(ahead).normalize();
     const turn = new Turn().setFromRotationMatrix(new Matrix4().makeBasis(right, ahead.clone().cross(right), ahead));
     camera.position = new Vector3(...view.position);

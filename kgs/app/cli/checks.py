@@ -117,13 +117,13 @@ def check_photos(
         shortest: least pixels of the shorter side in the fit.
     """
     from kgs.app.sfm.find import MAX_FRAMES, find_photos, find_video
-    from kgs.app.sfm.place import check_place
+    from kgs.app.sfm.workspace import check_workspace
 
     if find_video(folder):
         _check_views(views, hold_out, MAX_FRAMES if frames is None else frames, "frames")
         return
     paths = find_photos(folder)
-    check_place(out, folder)
+    check_workspace(out, folder)
     _check_views(views, hold_out, len(paths), "photos")
     if size is None and downscale is None:
         return

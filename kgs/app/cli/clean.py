@@ -59,7 +59,7 @@ def clean(
     from kgs.ply import save_ply
 
     check_strength(strength)
-    place = check_tools(device, backend)
+    torch_device = check_tools(device, backend)
     fit = None
     if splat.is_dir():
         request, fit = load_fit(splat, device, backend, say)
@@ -67,7 +67,7 @@ def clean(
         background = "white" if request.background == "white" else "black"
     elif cameras is not None:
         scene = load_cameras(cameras, downscale, photos=True, background=background)
-        fit = load_splat(splat, scene, place, backend)
+        fit = load_splat(splat, scene, torch_device, backend)
     if fit is not None:
         _check_some(splat, fit.model)
         cleaned = clean_fit(fit, strength, each)

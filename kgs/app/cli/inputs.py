@@ -35,7 +35,7 @@ def load_cameras(cameras: Path, downscale: float | None, photos: bool = False, *
     return scene
 
 
-def load_splat(ply: Path, scene: "Scene", place: "torch.device", backend: str) -> "Fit":
+def load_splat(ply: Path, scene: "Scene", device: "torch.device", backend: str) -> "Fit":
     """A splat in the frame of a scene: its near plane follows from the cameras, antialiasing from the file.
 
     A DataError if there is no Gaussian, or no camera of the scene sees one; single cameras that see none are named.
@@ -50,7 +50,7 @@ def load_splat(ply: Path, scene: "Scene", place: "torch.device", backend: str) -
         raise DataError(ply, "Gaussians", "expected at least one, got none")
     near_plane = Recipe().near_plane * typical_depths(model.means, scene.train.cameras)[0]
     options = RasterOptions(near_plane=near_plane, antialiased=model.antialiased)
-    fit = Fit(scene, model.to(place), options, backend)
+    fit = Fit(scene, model.to(device), options, backend)
     _check_seen(ply, fit)
     return fit
 

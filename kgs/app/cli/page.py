@@ -53,12 +53,12 @@ def page(
     from kgs.losses.photometric import WINDOW
     from kgs.metrics.evaluate import evaluate
 
-    place = check_tools(device, backend, "jinja2")
+    torch_device = check_tools(device, backend, "jinja2")
     scene = load_cameras(cameras, downscale, background=background)
     height, width = scene.train.images.shape[-2:]
     if min(height, width) < WINDOW:
         raise ValueError(f"downscale: expected photos of at least {WINDOW} pixels a side, got {width}x{height}")
-    fit = load_splat(ply, scene, place, backend)
+    fit = load_splat(ply, scene, torch_device, backend)
     few = spread(len(scene.train), MAX_PICTURES)
     photographed = load_scene(cameras, len(few), downscale, hold_out=0, background=background)
     pictured = in_frame_of(scene, photographed)

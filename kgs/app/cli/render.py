@@ -47,18 +47,18 @@ def render(
     from kgs.camera import move_camera
     from kgs.renderer import GaussianRenderer
 
-    place = check_tools(device, backend)
+    torch_device = check_tools(device, backend)
     is_transparent = background == "transparent"
     scene = load_cameras(cameras, downscale, background="black" if is_transparent else background)
-    fit = load_splat(ply, scene, place, backend)
+    fit = load_splat(ply, scene, torch_device, backend)
     renderer = GaussianRenderer(options=fit.options, backend=backend).eval()
     names = png_names(scene.train.names)
     check_folder(out, scene.root)
-    color = scene.background.to(place)
+    color = scene.background.to(torch_device)
     outputs = ("image", "alpha") if is_transparent else ("image",)
     with replacing(out, "renders") as new, torch.no_grad():
         for i, name in each(list(enumerate(scene.train.names)), "pictures", "view"):
-            rendering = renderer(fit.model(), move_camera(scene.train.camera(i), place), color, outputs)
+            rendering = renderer(fit.model(), move_camera(scene.train.camera(i), torch_device), color, outputs)
             image = rendering.image
             if is_transparent:  # PNG's colours are not multiplied by alpha
                 image = torch.cat([image / rendering.alpha.clamp_min(1e-6), rendering.alpha], 1)

@@ -93,8 +93,8 @@ def exit_code(words: list[str]) -> int:
     except BrokenPipeError:
         return 0  # the reader has what it wanted
     except OSError as error:
-        place = f"{printable(error.filename)}: " if error.filename else ""
-        message = f"{place}{error.strerror}"
+        prefix = f"{printable(error.filename)}: " if error.filename else ""
+        message = f"{prefix}{error.strerror}"
         code = 2 if error.errno in USER_ERRORS else 1
     except (MemoryError, RuntimeError) as error:
         if not _is_out_of_memory(error):

@@ -61,9 +61,9 @@ def camera_list(views: Sequence[Views], offset: Tensor, means: Tensor) -> list[d
 
 def _bounds(means: Tensor, offset: Tensor) -> list[list[float]]:
     """Two opposite corners of a box around the centres `(N, 3)`, N >= 1, without a sky and without strays."""
-    places = means.detach().double().cpu().numpy()
-    distances = np.linalg.norm(places - np.median(places, axis=0), axis=1)
-    near = places[distances <= _DISTANT * np.median(distances)]
+    points = means.detach().double().cpu().numpy()
+    distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    near = points[distances <= _DISTANT * np.median(distances)]
     corners = np.quantile(near, [_OUTSIDE, 1 - _OUTSIDE], axis=0) + offset.double().cpu().numpy()
     bounds: list[list[float]] = corners.tolist()
     return bounds

@@ -152,12 +152,12 @@ def _speed_up(path: Path, seconds: float) -> bool:
     }
     with path.open("r+b") as file:
         head = file.read(_HEAD_BYTES)
-        places = {element: head.find(element) for element in values}
-        for element, place in places.items():
-            if place >= 0:
-                file.seek(place + len(element))
+        offsets = {element: head.find(element) for element in values}
+        for element, offset in offsets.items():
+            if offset >= 0:
+                file.seek(offset + len(element))
                 file.write(values[element])
-    return min(places.values()) >= 0
+    return min(offsets.values()) >= 0
 
 
 def _write_mp4(path: Path, frames: Iterable[Frame], size: tuple[int, int]) -> tuple[int, str]:

@@ -90,9 +90,9 @@ def _draw_grid(draw: ImageDraw.ImageDraw, begin: tuple[float, float], end: tuple
     draw.line([_DRAWN * value for value in (*begin, *end)], _GRID, _DRAWN)
 
 
-def _draw_text(draw: ImageDraw.ImageDraw, place: tuple[float, float], text: str, anchor: str) -> None:
+def _draw_text(draw: ImageDraw.ImageDraw, position: tuple[float, float], text: str, anchor: str) -> None:
     font = ImageFont.load_default(_DRAWN * _FONT)
-    draw.text((_DRAWN * place[0], _DRAWN * place[1]), text, _TEXT, font, anchor=anchor)
+    draw.text((_DRAWN * position[0], _DRAWN * position[1]), text, _TEXT, font, anchor=anchor)
 
 
 def _draw_line(draw: ImageDraw.ImageDraw, points: Any, line: dict[str, Any]) -> None:

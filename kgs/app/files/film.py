@@ -118,27 +118,27 @@ def resample_by_speed(extrinsics: Tensor, frames: int, depth: float) -> Tensor:
     path = torch.linalg.inv(camera_path(extrinsics, even, depth))
     centers = camera_centers(extrinsics)
     unit = float(torch.cdist(centers, centers).max()) or depth
-    places = torch.cat([path[:, :3, 3] / unit, path[:, :3, 2] / torch.pi], 1).numpy()
-    done = np.append(0, np.linalg.norm(np.diff(places, axis=0), axis=1).cumsum())
+    points = torch.cat([path[:, :3, 3] / unit, path[:, :3, 2] / torch.pi], 1).numpy()
+    done = np.append(0, np.linalg.norm(np.diff(points, axis=0), axis=1).cumsum())
     if done[-1] < 1e-9:  # it does not move
         return camera_path(extrinsics, np.arange(frames) / frames, depth)
     shares = np.interp(even, done / done[-1], even)  # of the path's time, after equal parts of its length
-    speeds = _speeds(np.stack([np.interp(shares, even, column) for column in places.T], 1))
+    speeds = _speeds(np.stack([np.interp(shares, even, column) for column in points.T], 1))
     times = np.append(0, (2 / (speeds[1:] + speeds[:-1])).cumsum())
     return camera_path(extrinsics, np.interp(np.arange(frames) / frames, times / times[-1], shares), depth)
 
 
-def _speeds(places: Array) -> Array:
-    """Speeds in [0, 1] at places `(M, D)` at equal distances along a path; 0 at both ends."""
-    part = 1 / (len(places) - 1)
-    steps = np.diff(places, axis=0)
+def _speeds(points: Array) -> Array:
+    """Speeds in [0, 1] at points `(M, D)` at equal distances along a path; 0 at both ends."""
+    part = 1 / (len(points) - 1)
+    steps = np.diff(points, axis=0)
     steps /= np.linalg.norm(steps, axis=1, keepdims=True).clip(1e-12)
     turns = np.arccos((steps[1:] * steps[:-1]).sum(1).clip(-1, 1)) / part  # one over the radius
     squares = np.append(np.append(0, np.minimum(1, _TURN / turns.clip(1e-9))), 0)
-    gains = 2 * _TURN * part * np.arange(len(places))  # v^2 - 2 a s is constant while it accelerates
+    gains = 2 * _TURN * part * np.arange(len(points))  # v^2 - 2 a s is constant while it accelerates
     squares[1:-1] = np.minimum.accumulate(squares[1:-1] - gains[1:-1]) + gains[1:-1]
     squares[1:-1] = (np.minimum.accumulate((squares[1:-1] + gains[1:-1])[::-1]))[::-1] - gains[1:-1]
-    ends = np.linspace(0, 1, len(places)) / _RAMP
+    ends = np.linspace(0, 1, len(points)) / _RAMP
     speeds: Array = np.sqrt(np.minimum(squares, np.minimum(ends, ends[::-1])))
     return speeds
 
@@ -157,7 +157,7 @@ def camera_path(extrinsics: Tensor, shares: Array, depth: float) -> Tensor:
 
     Args:
         extrinsics: `(V, 4, 4)`, V >= 1.
-        shares: `(frames,)`, of the path, in [0, 1]: 0 is its beginning and 1 the same place again, its end.
+        shares: `(frames,)`, of the path, in [0, 1]: 0 is its beginning and 1 the same point again, its end.
         depth: distance from the cameras to the scene, in world units; used for a single camera.
 
     Returns:
@@ -170,21 +170,21 @@ def camera_path(extrinsics: Tensor, shares: Array, depth: float) -> Tensor:
     order = _round_trip(distances)
     order = [order[i] for i in np.linspace(0, len(order), min(_STOPS, len(order)), endpoint=False).astype(int)]
     times = np.array([distances[a, b] for a, b in zip(order, order[1:] + order[:1], strict=True)]).clip(1e-6)
-    places = poses[order, :3, 3]
+    centers = poses[order, :3, 3]
     rotations = poses[order, :3, :3]
     focus = meeting_point(extrinsics[order])
     if focus is None:
-        places, rotations = _interpolated(places, rotations, times, shares)
-        return _extrinsics(places, rotations)
+        centers, rotations = _interpolated(centers, rotations, times, shares)
+        return _extrinsics(centers, rotations)
 
     # Interpolate the direction and the distance from the focus, and the rotation relative to looking at it.
     down = -upright(extrinsics)[1]
-    radii = (places - focus).norm(dim=1, keepdim=True)
-    rotations = _looking_at(focus, places, down).mT @ rotations
-    polar = torch.cat([(places - focus) / radii, radii], 1)
+    radii = (centers - focus).norm(dim=1, keepdim=True)
+    rotations = _looking_at(focus, centers, down).mT @ rotations
+    polar = torch.cat([(centers - focus) / radii, radii], 1)
     polar, rotations = _interpolated(polar, rotations, times, shares)
-    places = focus + polar[:, 3:] * normalize(polar[:, :3], dim=1)
-    return _extrinsics(places, _looking_at(focus, places, down) @ rotations)
+    centers = focus + polar[:, 3:] * normalize(polar[:, :3], dim=1)
+    return _extrinsics(centers, _looking_at(focus, centers, down) @ rotations)
 
 
 def _distances(poses: Tensor) -> Array:
@@ -201,22 +201,22 @@ def _sway(pose: Tensor, shares: Array, depth: float) -> Tensor:
     """Poses on a small ellipse beside one camera, looking at the point at `depth` on its optical axis."""
     angles = 2 * torch.pi * torch.from_numpy(shares)
     right, down, forward = pose[:3, :3].T
-    places = _SWAY * depth * (angles.sin()[:, None] * right + 0.4 * (1 - angles.cos())[:, None] * down)
-    return _extrinsics(pose[:3, 3] + places, _looking_at(depth * forward, places, down))
+    offsets = _SWAY * depth * (angles.sin()[:, None] * right + 0.4 * (1 - angles.cos())[:, None] * down)
+    return _extrinsics(pose[:3, 3] + offsets, _looking_at(depth * forward, offsets, down))
 
 
-def _looking_at(target: Tensor, places: Tensor, down: Tensor) -> Tensor:
-    """Camera-to-world rotations `(F, 3, 3)` of cameras at `places` that look at the target, with `down` below."""
-    forward = normalize(target - places, dim=1)
+def _looking_at(target: Tensor, centers: Tensor, down: Tensor) -> Tensor:
+    """Camera-to-world rotations `(F, 3, 3)` of cameras with these centres that look at a target, with `down` below."""
+    forward = normalize(target - centers, dim=1)
     right = normalize(torch.linalg.cross(down.expand_as(forward), forward), dim=1)
     return torch.stack([right, torch.linalg.cross(forward, right), forward], 2)
 
 
-def _extrinsics(places: Tensor, rotations: Tensor) -> Tensor:
+def _extrinsics(centers: Tensor, rotations: Tensor) -> Tensor:
     """World-to-camera matrices `(F, 4, 4)` from positions and camera-to-world rotations."""
-    poses = torch.eye(4, dtype=torch.float64).repeat(len(places), 1, 1)
+    poses = torch.eye(4, dtype=torch.float64).repeat(len(centers), 1, 1)
     poses[:, :3, :3] = rotations
-    poses[:, :3, 3] = places
+    poses[:, :3, 3] = centers
     extrinsics: Tensor = torch.linalg.inv(poses)
     return extrinsics
 

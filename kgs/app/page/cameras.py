@@ -42,7 +42,7 @@ def viewer_scene(
         psnr: of the renders of photos, in dB, by their names, as far as it is known.
 
     Returns:
-        cameras: for each camera its name, part, label (its photo's place in the order of names), size (width, height),
+        cameras: for each camera its name, part, label (its photo's number in the order of names), size (width, height),
             focal lengths and principal point (pixels), rotation, position, and the median depth of the Gaussians that
             it sees (distance).
         first: index of the camera that the viewer opens at: among the third of the training cameras that are nearest
@@ -57,7 +57,7 @@ def viewer_scene(
     positions = camera_centers(cameras.extrinsics).numpy()
     points = means.detach().cpu().double().numpy()
     entries = list[dict[str, Any]]()
-    order = {name: place for place, name in enumerate(sorted(names), 1)}
+    order = {name: number for number, name in enumerate(sorted(names), 1)}
     for name, part, position, (k, pose, size) in zip(names, parts, positions, lenses(cameras), strict=True):
         depths = visible_points(points, k, pose, size)[:, 2]
         entries.append(

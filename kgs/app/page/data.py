@@ -4,7 +4,7 @@ The format: `count` Gaussians, stored in columns of one number per Gaussian. A c
 `count` bytes each; the first plane holds the most significant bytes. A value is `low + step * integer`.
 
 Positions are in world units, scales are natural logarithms. Quaternions w, x, y, z have length 1 and lack the component
-with the largest magnitude, which is positive and whose place is `largest`; the other three are stored in order.
+with the largest magnitude, which is positive and whose index is `largest`; the other three are stored in order.
 Harmonics are the signed square roots of the coefficients, so that small ones keep more digits: a coefficient is
 `value * |value|`. Their order is that of PLY files: by coefficient, then r, g, b.
 
@@ -40,7 +40,7 @@ _BULK = 0.99  # share of the values of a column whose digits are kept whatever t
 _MAX_SPREAD = 8.0  # times the range of these values: what the whole range may be without more bits
 _MAX_BITS = 48  # of any number: JavaScript has whole numbers of 53
 _MIN_SCALE = 1e-12  # smaller scales are raised to this one, whose logarithm is finite
-_CELL_BITS = 16  # bits per axis of the cells that sort Gaussians by their place
+_CELL_BITS = 16  # bits per axis of the cells that sort Gaussians by their position
 _GZIP_HEADER = b"\x1f\x8b\x08" + bytes(6) + b"\xff"  # without file name, time and operating system
 _LAST_BLOCK = b"\x03\0"  # an empty DEFLATE block that ends the stream
 _TARGET_SHARE = 0.97  # share of the limit to aim at when Gaussians are left out
@@ -183,7 +183,7 @@ def _compressed_columns(
     values: dict[str, Array], cameras: PinholeCamera, near_plane: float, bits: int, degree: int
 ) -> list[tuple[Column, bytes]]:
     """The columns, and the DEFLATE blocks of each, which do not depend on other columns and end at a byte boundary."""
-    order = _by_place(values["means"])
+    order = _morton_order(values["means"])
     ordered = {name: value[order] for name, value in values.items()}
     pixels_per_unit = _pixels_per_unit(ordered["means"], cameras, near_plane)
     compressed = list[tuple[Column, bytes]]()
@@ -288,7 +288,7 @@ def _opacity_times_area(values: dict[str, Array]) -> Array:
     return product
 
 
-def _by_place(means: Array) -> NDArray[np.intp]:
+def _morton_order(means: Array) -> NDArray[np.intp]:
     """An order along a Morton curve, in which Gaussians mostly follow their neighbours: it compresses better."""
     ranks = means.argsort(axis=0, kind="stable").argsort(axis=0, kind="stable").astype(np.uint64)
     cells = ranks * np.uint64(2**_CELL_BITS) // np.uint64(max(1, len(means)))

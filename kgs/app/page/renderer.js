@@ -121,10 +121,10 @@ class DepthOrder {
     }
     for (const shift of [0, 16]) {
       const digit = (i) => 65535 - ((bits[i] >>> shift) & 65535);  // a larger depth has a smaller digit
-      const places = new Uint32Array(65537);
-      for (let k = 0; k < count; k++) places[digit(from[k]) + 1]++;
-      for (let value = 0; value < 65536; value++) places[value + 1] += places[value];
-      for (let k = 0; k < count; k++) to[places[digit(from[k])]++] = from[k];
+      const offsets = new Uint32Array(65537);
+      for (let k = 0; k < count; k++) offsets[digit(from[k]) + 1]++;
+      for (let value = 0; value < 65536; value++) offsets[value + 1] += offsets[value];
+      for (let k = 0; k < count; k++) to[offsets[digit(from[k])]++] = from[k];
       [from, to] = [to, from];
     }
     return from.subarray(0, count);

@@ -20,7 +20,7 @@ const MIN_COVERAGE = 1 / 3;  // of the stage, by the splat: where the eye roams 
 const MIN_PART = 1 / 2;  // likewise, of what it covers from the photo's camera, where that is less
 const ROAMING_STEP = 0.1;  // radians: how finely this is tested
 const NEAR_CAMERA = 0.02;  // of the distance: an eye farther than this from all cameras is beside them
-const MIN_ZOOM = 0.3, MAX_ZOOM = 3;  // of the distance at the camera that the eye was last placed at
+const MIN_ZOOM = 0.3, MAX_ZOOM = 3;  // of the distance at the camera that the eye last jumped to
 const SLOW_SECONDS_PER_CAMERA = 4;  // of a tour that nobody asked for
 const TOUR_BEGIN_SECONDS = 2;  // in which the eye joins the path
 const TOUR_STILL_SECONDS = 1.5;  // of each picture, where the system asks for less motion
@@ -77,7 +77,7 @@ class Viewer {
     this.isEngaged = false;  // the last press of a pointer was on the stage
     this.tour = null;  // the latest one, while it goes on
     this.playButton = frame.querySelector(".play");
-    this.place(scene.first);
+    this.jumpTo(scene.first);
     this.listen(frame);
     this.ruler = new Ruler(this, frame);
     new ResizeObserver(() => this.requestDraw()).observe(this.canvas);
@@ -88,7 +88,7 @@ class Viewer {
   // -- The eye: rotation, position, distance to the point that it turns around, and the intrinsics of a photo's camera.
 
   // Puts the eye at a camera at once.
-  place(index) {
+  jumpTo(index) {
     const { rotation, position, distance, size, focal, centre } = this.scene.cameras[index];
     this.eye = { rotation, position, distance, size, focal, centre };
     this.usualDistance = distance;
@@ -117,7 +117,7 @@ class Viewer {
   flyTo(index) {
     const from = this.eye;
     this.endTour();
-    this.place(index);
+    this.jumpTo(index);
     const to = this.eye;
     const begin = performance.now();
     const flight = ++this.flight;
@@ -172,10 +172,10 @@ class Viewer {
     this.tour = tour;
     const pose = (index) => ({ ...begin, ...poses[(start + index) % poses.length] });
     const eyeAt = (seconds) => {
-      const place = poses.length * seconds / secondsPerRound;
-      if (still) return pose(still * Math.floor(place / still));
+      const onTour = poses.length * seconds / secondsPerRound;
+      if (still) return pose(still * Math.floor(onTour / still));
       const begun = Math.min(1, seconds / TOUR_BEGIN_SECONDS);
-      const onPath = this.between(pose(Math.floor(place)), pose(Math.floor(place) + 1), place % 1);
+      const onPath = this.between(pose(Math.floor(onTour)), pose(Math.floor(onTour) + 1), onTour % 1);
       return this.between(begin, onPath, begun * begun * (3 - 2 * begun));
     };
     const step = (now) => {

@@ -176,12 +176,12 @@ def _strip(photos: PagePhotos, cameras: Sequence[Mapping[str, Any]]) -> list[dic
     shown = [i for i, name in enumerate(names) if not small or name in small]
     chosen = [shown[k] for k in in_strip([names[i] for i in shown])]
     pictures = thumbnails([small[names[i]] for i in chosen], _THUMBNAIL_BYTES) if small else [{} for _ in chosen]
-    places = {name: place for place, name in enumerate(sorted(names), 1)}
+    numbers = {name: number for number, name in enumerate(sorted(names), 1)}
     return [
         {
             "index": i,
             "label": cameras[i]["label"],
-            "number": places[names[i]],
+            "number": numbers[names[i]],
             "held_out": cameras[i]["part"] == "test",
             **picture,
         }

@@ -84,8 +84,8 @@ def agreed_cameras(
             raise DataError(folder, "", reason)
         solvers = _Solvers((first, second), second_matches, images, work, seed, exif_focals(photos), executor, pairs)
         solutions, held = solvers.solve(kept)
-        while unplaced := without_cameras(solutions, list(kept.values()), pairs):
-            left_out |= unplaced
+        while untrusted := without_cameras(solutions, list(kept.values()), pairs):
+            left_out |= untrusted
             kept = {image: name for image, name in kept.items() if name not in left_out}
             solutions, held = solvers.solve(kept)
         lap("cameras")
@@ -120,8 +120,8 @@ class _Solvers:
     def solve(self, names: Mapping[str, str]) -> tuple[list[Cameras | None], list[float]]:
         """What each solver finds, and the focal lengths of the Exif if the photos do not tell them, else [].
 
-        Where photos would be left out, those that failed look again. `names` are those of the photos to place, by those
-        of their images.
+        Where photos would be left out, those that failed look again. `names` are those of the photos to register, by
+        those of their images.
         """
         free = self._both(lambda solver: self._solve(solver, names))
         solutions, held = self._held_if_in_doubt(free, names)
@@ -136,10 +136,10 @@ class _Solvers:
         self, solutions: list[Cameras | None], names: Mapping[str, str]
     ) -> tuple[list[Cameras | None], list[float]]:
         """The solutions, or those with the focal lengths of the Exif if these are known and the photos tell none."""
-        placed = [cameras for cameras in solutions if cameras]
+        solved = [cameras for cameras in solutions if cameras]
         known = [focal for focal in self.exif_focals if focal]
         is_known = len(known) == len(self.exif_focals)
-        if not is_known or not placed or not (focal_doubt(placed) or focal_difference(placed)):
+        if not is_known or not solved or not (focal_doubt(solved) or focal_difference(solved)):
             return solutions, []
         return self._both(lambda solver: self._solve(solver, names, known)), known
 
@@ -155,8 +155,8 @@ class _Solvers:
             found = solutions[solver]
             if well[solver] == photos and not is_disputed:
                 return found
-            place = (self.databases[solver], self.images, self.work / f"again{solver}", self.seed)
-            return look_again(*place, names, focals, found, solutions[1 - solver], photos)
+            arguments = (self.databases[solver], self.images, self.work / f"again{solver}", self.seed)
+            return look_again(*arguments, names, focals, found, solutions[1 - solver], photos)
 
         return self._both(look)
 

@@ -21,7 +21,7 @@ MIN_POINTS = 50  # that each photo sees
 MAX_DEGREES = 2.0  # between the two solvers' rotations of a pair
 MAX_RATIO = 1.15  # of their focal lengths
 MIN_RISE = 0.03  # relative growth of the squared errors if the focal length is a quarter off
-SAME_PLACE = 1.0  # pixels; photos whose matches move less in the median were taken from one place
+MIN_SHIFT = 1.0  # pixels; photos whose matches move less in the median were taken from one place
 _PLANAR = 0.97  # share of matches that one homography explains; a scene with depth has a pair with a lower one
 _WITHOUT = "A fit without some photos: take them out of the folder"
 _FORWARD = (
@@ -57,7 +57,7 @@ def objections(cameras: Cameras | None, names: Sequence[str], longest: int) -> l
 def disagreement(first: Cameras, second: Cameras) -> tuple[float, tuple[str, str]]:
     """The largest angle, in degrees, between two solvers' relative rotations of a pair, and that pair.
 
-    It is 180 for a pair of which one solver did not place both photos.
+    It is 180 for a pair of which one solver did not register both photos.
     """
     worst = (0.0, ("", ""))
     for pair in combinations(sorted({*first.rotations, *second.rotations}), 2):
@@ -83,9 +83,9 @@ def focal_doubt(solutions: Sequence[Cameras]) -> str:
 
 def focal_difference(solutions: Sequence[Cameras]) -> str:
     """How far the solvers' focal lengths are apart, if that is too far; "" if it is not. Each lens counts."""
-    placed = set[str].intersection(*(set(cameras.focals) for cameras in solutions))
+    registered = set[str].intersection(*(set(cameras.focals) for cameras in solutions))
     focals = [[cameras.focal for cameras in solutions]]
-    focals += [[cameras.focals[name] for cameras in solutions] for name in placed]
+    focals += [[cameras.focals[name] for cameras in solutions] for name in registered]
     ratio = max(max(of_lens) / min(of_lens) for of_lens in focals)
     if ratio <= MAX_RATIO:
         return ""
@@ -119,7 +119,7 @@ def judge(
     good = {i: cameras for i, cameras in enumerate(solutions) if cameras and not reasons[i]}
     if not good:
         raise DataError(folder, "", refusal(reasons[0], names, pairs, forward, _missing(solutions[0], names)))
-    for cameras in solutions:  # nothing confirms a photo that only one solver placed
+    for cameras in solutions:  # nothing confirms a photo that only one solver registered
         if missing := _missing(cameras, names):
             reason = f"of two solvers one could not place {', '.join(missing)}, so that nothing confirms the other"
             raise DataError(folder, "", refusal([reason], names, pairs, forward, missing))
@@ -165,18 +165,18 @@ def weakest_link(names: Sequence[str], pairs: Pairs) -> tuple[str, str]:
 
 
 def gap(name: str, others: Sequence[str], pairs: Pairs) -> tuple[str, str]:
-    """The photos beside a gap: one that could not be placed, and that of the others with most matches.
+    """The photos beside a gap: one that could not be registered, and that of the others with most matches.
 
     `others` are in the order in which they were taken; where none matches, the one taken next to it counts.
     """
     in_order = sorted([*others, name])
-    place = in_order.index(name)
+    index = in_order.index(name)
 
     def closeness(other: str) -> tuple[int, int]:
-        return matches_of(pairs, name, other), -abs(in_order.index(other) - place)
+        return matches_of(pairs, name, other), -abs(in_order.index(other) - index)
 
     nearest = max(others, key=closeness)
-    return (name, nearest) if in_order.index(nearest) > place else (nearest, name)
+    return (name, nearest) if in_order.index(nearest) > index else (nearest, name)
 
 
 def matches_of(pairs: Pairs, one: str, other: str) -> int:
@@ -201,7 +201,7 @@ def why_no_cameras(names: Sequence[str], pairs: Pairs, geometries: Mapping[tuple
         pairs: verified matches of each pair.
         geometries: what the matches of each overlapping pair say about depth.
     """
-    if twins := [pair for pair, geometry in geometries.items() if geometry.shift < SAME_PLACE]:
+    if twins := [pair for pair, geometry in geometries.items() if geometry.shift < MIN_SHIFT]:
         one, other = twins[0]
         return (
             f"{one} and {other} match at the same pixels: either they show the same from the same place, so remove one "
@@ -252,8 +252,8 @@ def refusal(
     """
     if forward:
         return f"no cameras that can be trusted: {'; '.join(reasons)}. {_FORWARD}. {_WITHOUT}.\n{table(names, pairs)}"
-    placed = [name for name in names if name not in missing]
-    between = " and ".join(gap(missing[0], placed, pairs) if missing and placed else weakest_link(names, pairs))
+    registered = [name for name in names if name not in missing]
+    between = " and ".join(gap(missing[0], registered, pairs) if missing and registered else weakest_link(names, pairs))
     return (
         f"no cameras that can be trusted: {'; '.join(reasons)}. What helps most: photos from places between {between}, "
         "with steps to the side or up (turning on the spot shows no depth), so that neighbours share two thirds of the "
@@ -263,7 +263,7 @@ def refusal(
 
 
 def _missing(cameras: Cameras | None, names: Sequence[str]) -> list[str]:
-    """The photos that a solver did not place."""
+    """The photos that a solver did not register."""
     return [name for name in names if cameras is None or name not in cameras.points]
 
 

@@ -2,7 +2,7 @@
 
 A photo is left out if it is a copy, or of another shape than most while no Exif says its focal length; if it shows
 another place, or the same from the same place as another one; or if its camera cannot be trusted: each solver has to
-place it, it has to see enough points, and both have to agree about it and its lens, if need be at a second look
+register it, it has to see enough points, and both have to agree about it and its lens, if need be at a second look
 (:mod:`kgs.app.sfm.second_look`). At least three photos remain, or nothing is left out and the gates refuse all.
 """
 
@@ -12,7 +12,7 @@ from itertools import combinations
 from kgs._support.errors import DataError
 
 from .find import MIN_PHOTOS, listed_files
-from .gates import MAX_DEGREES, MAX_RATIO, MIN_POINTS, SAME_PLACE, Pairs, angle_between, gap, groups_of, matches_of
+from .gates import MAX_DEGREES, MAX_RATIO, MIN_POINTS, MIN_SHIFT, Pairs, angle_between, gap, groups_of, matches_of
 from .map import Cameras, PairGeometry
 from .read import OpenPhoto, by_shape
 
@@ -84,7 +84,7 @@ def without_overlap(
     left = {
         second: f"it shows the same from the same place as {first}"
         for (first, second), geometry in geometries.items()
-        if geometry.shift < SAME_PLACE
+        if geometry.shift < MIN_SHIFT
     }
     kept = [name for name in names if name not in left]
     groups = groups_of(kept, pairs)
@@ -104,8 +104,8 @@ def without_cameras(solutions: Sequence[Cameras | None], names: Sequence[str], p
     first, second = solutions
     if first is None or second is None:
         return {}
-    # without photos that were placed badly the solvers may agree about the others
-    left = _placed_badly(first, second, names, pairs) or _disputed(first, second, list(names))
+    # without photos that were registered badly the solvers may agree about the others
+    left = _registered_badly(first, second, names, pairs) or _disputed(first, second, list(names))
     return left if len(names) - len(left) >= MIN_PHOTOS else {}
 
 
@@ -114,21 +114,21 @@ def doubtful(solutions: Sequence[Cameras | None], names: Sequence[str], pairs: P
     first, second = solutions
     if first is None or second is None:
         return set(names)
-    left = _placed_badly(first, second, names, pairs)
+    left = _registered_badly(first, second, names, pairs)
     return {*left, *_disputed(first, second, [name for name in names if name not in left])}
 
 
-def _placed_badly(first: Cameras, second: Cameras, names: Sequence[str], pairs: Pairs) -> dict[str, str]:
-    """The photos that a solver did not place, that see few points, or whose lens is disputed, and why."""
+def _registered_badly(first: Cameras, second: Cameras, names: Sequence[str], pairs: Pairs) -> dict[str, str]:
+    """The photos that a solver did not register, that see few points, or whose lens is disputed, and why."""
     left = dict[str, str]()
     for name in names:
         solvers = (name in first.points) + (name in second.points)
         if solvers < 2:
             who = "only one of two solvers" if solvers else "neither of two solvers"
             left[name] = f"{who} could place it{_advice(name, names, pairs)}"
-    placed = [name for name in names if name not in left]
-    better = max((first, second), key=lambda cameras: _seen_well(cameras, placed))
-    for name in placed:
+    registered = [name for name in names if name not in left]
+    better = max((first, second), key=lambda cameras: _seen_well(cameras, registered))
+    for name in registered:
         if better.points[name] < MIN_POINTS:
             few = f"only {better.points[name]} points are seen in it, fewer than {MIN_POINTS}"
             left[name] = f"{few}{_advice(name, names, pairs)}"

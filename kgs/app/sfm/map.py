@@ -24,8 +24,8 @@ from .pycolmap_processes import check_space
 MIN_MATCHES = 30  # verified matches of a pair that overlaps; of noise up to 27 were verified
 _MAX_ERROR = 1.5  # largest reprojection error, in pixels
 _FIRST_PAIR_DEGREES = 2.0  # least angle between the first two photos; COLMAP's 16 fails on photos that face one way
-_FIRST_PAIR_DEGREES_AGAIN = 0.2  # the same in a second attempt, if the first one places no pair
-_ROUNDS = 5  # at most, each of placing photos with the lens held and then adjusting it
+_FIRST_PAIR_DEGREES_AGAIN = 0.2  # the same in a second attempt, if the first one registers no pair
+_ROUNDS = 5  # at most, each of registering photos with the lens held and then adjusting it
 _CONVERGED = 0.01  # relative change of the focal length, and change of the distortion, at which rounds end
 _USUAL_DISTORTION = 0.05  # radial; larger ones have to explain much of the errors
 _DISTORTION_GAIN = 0.1  # share of the squared errors that a larger distortion has to explain
@@ -54,7 +54,7 @@ class PairGeometry(NamedTuple):
 
     shift: float  # median distance that they move between the photos, pixels
     planar: float  # share that one homography explains: 1 where the camera only turned, or saw one plane
-    forward: bool = False  # whether each photo shows the place of the other: the camera moved along its view
+    forward: bool = False  # whether each photo shows where the other was taken: the camera moved along its view
 
 
 @contextmanager
@@ -87,13 +87,13 @@ def pair_geometries(database: Path, names: Mapping[str, str]) -> dict[tuple[str,
     geometries = {}
     with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database) as file:
         images = {image.image_id: names[image.name] for image in file.read_all_images()}
-        places = {i: file.read_keypoints(i)[:, :2] for i in images}
+        keypoints = {i: file.read_keypoints(i)[:, :2] for i in images}
         lens = file.read_all_cameras()[0]
         for i, j in combinations(sorted(images), 2):
             rows = _inliers(file, i, j)
             if len(rows) >= MIN_MATCHES:
-                first = places[i][rows[:, 0]]
-                second = places[j][rows[:, 1]]
+                first = keypoints[i][rows[:, 0]]
+                second = keypoints[j][rows[:, 1]]
                 _, planar = cv2.findHomography(first, second, cv2.RANSAC, _MAX_ERROR)
                 shift = float(np.median(np.linalg.norm(first - second, axis=1)))
                 share = 0.0 if planar is None else float(np.mean(planar))
@@ -102,19 +102,19 @@ def pair_geometries(database: Path, names: Mapping[str, str]) -> dict[tuple[str,
 
 
 def _is_forward(first: NDArray[np.float64], second: NDArray[np.float64], lens: Any) -> bool:
-    """Whether both photos show the place of the other's camera, and nearly all matches `(M, 2)` move away from it.
+    """Whether both photos show the centre of the other's camera, and nearly all matches `(M, 2)` move away from it.
 
-    These places are the epipoles, of a matrix that few or wrong matches leave open: hence the second condition.
+    The centres are seen at the epipoles, of a matrix that few or wrong matches leave open: hence the second condition.
     """
     fundamental, _ = cv2.findFundamentalMat(first, second, cv2.FM_RANSAC, _MAX_ERROR, 0.999)
     if fundamental is None or fundamental.shape != (3, 3):
         return False
-    epipoles = np.array([np.linalg.svd(matrix)[2][-1] for matrix in (fundamental, fundamental.T)])
+    homogeneous = np.array([np.linalg.svd(matrix)[2][-1] for matrix in (fundamental, fundamental.T)])
     with np.errstate(divide="ignore", invalid="ignore"):
-        places = epipoles[:, :2] / epipoles[:, 2:]
-    if not bool(((places > 0) & (places < (lens.width, lens.height))).all()):
+        epipoles = homogeneous[:, :2] / homogeneous[:, 2:]
+    if not bool(((epipoles > 0) & (epipoles < (lens.width, lens.height))).all()):
         return False
-    away = np.linalg.norm(second - places[1], axis=1) > np.linalg.norm(first - places[0], axis=1)
+    away = np.linalg.norm(second - epipoles[1], axis=1) > np.linalg.norm(first - epipoles[0], axis=1)
     return bool(abs(away.mean() - 0.5) > _ONE_WAY - 0.5)
 
 
@@ -128,24 +128,24 @@ def solve(
     *,
     first_pair: tuple[str, str] | None = None,
     start: Cameras | None = None,
-    min_placed: int = 0,
+    min_registered: int = 0,
 ) -> Cameras | None:
-    """Cameras and points from verified matches, of as many photos as can be placed; None if no pair can be.
+    """Cameras and points from verified matches, of as many photos as can be registered; None if no pair can be.
 
-    Lenses are held while photos are placed, because two photos do not determine them, and adjusted to all of them after
-    that. This is repeated with the lenses that came out until they no longer change.
+    Lenses are held while photos are registered, because two photos do not determine them, and adjusted to all of them
+    after that. This is repeated with the lenses that came out until they no longer change.
 
     Args:
         database: with verified matches, and a first guess of each lens.
         images: the folder of the photos.
         work: a folder for what the mapper writes.
         seed: of its random choices.
-        names: the names of the photos to place, by those of the images in the database.
+        names: the names of the photos to register, by those of the images in the database.
         focals: the focal length of each lens in pixels if they are known; (): they are adjusted.
-        first_pair: the images in the database that are placed first; None: the mapper chooses.
-        start: cameras of other matches that are there before any photo is placed. Their points are computed anew, from
-            the matches of the database, and then the cameras are adjusted to these.
-        min_placed: how many photos have to be placed; where the first round places fewer, the result is None.
+        first_pair: the images in the database that are registered first; None: the mapper chooses.
+        start: cameras of other matches that are there before any photo is registered. Their points are computed anew,
+            from the matches of the database, and then the cameras are adjusted to these.
+        min_registered: how many photos have to be; where the first round registers fewer, the result is None.
     """
     best = None
     error = 0.0
@@ -167,7 +167,11 @@ def solve(
                 scene = _map(pycolmap, database, images, work, options, not is_held)
             else:
                 scene = _map_from(pycolmap, database, images, work, options, _started(file, start, names))
-            if scene is None or (best is not None and _is_worse(scene, best)) or scene.num_reg_images() < min_placed:
+            if (
+                scene is None
+                or scene.num_reg_images() < min_registered
+                or (best is not None and _is_worse(scene, best))
+            ):
                 break
             best, error = _adjust(scene, is_held)
             changes = [_change(lenses[camera_id], lens) for camera_id, lens in best.cameras.items()]
@@ -192,20 +196,20 @@ def _change(before: Any, after: Any) -> float:
 def cameras_of(reconstruction: Any, names: Mapping[str, str], focal_rise: float) -> Cameras:
     """The cameras of a reconstruction by the photos' names, in the order of `names`."""
     images = {image.name: image for image in reconstruction.images.values() if image.has_pose}
-    placed = {name: images[image] for image, name in names.items() if image in images}
-    poses = {name: image.cam_from_world().matrix() for name, image in placed.items()}
+    registered = {name: images[image] for image, name in names.items() if image in images}
+    poses = {name: image.cam_from_world().matrix() for name, image in registered.items()}
     return Cameras(
-        {name: float(reconstruction.cameras[image.camera_id].focal_length) for name, image in placed.items()},
+        {name: float(reconstruction.cameras[image.camera_id].focal_length) for name, image in registered.items()},
         {name: pose[:, :3] for name, pose in poses.items()},
         {name: -pose[:, :3].T @ pose[:, 3] for name, pose in poses.items()},
-        {name: int(image.num_points3D) for name, image in placed.items()},
+        {name: int(image.num_points3D) for name, image in registered.items()},
         reconstruction,
         focal_rise,
     )
 
 
 def _mapper_options(pycolmap: Any, images: list[str], seed: int) -> Any:
-    """The settings with which the mapper places these images of a database."""
+    """The settings with which the mapper registers these images of a database."""
     options = pycolmap.IncrementalPipelineOptions()
     options.image_names = images
     options.num_threads = options.mapper.num_threads = 1
@@ -227,9 +231,9 @@ def _mapper_options(pycolmap: Any, images: list[str], seed: int) -> Any:
 
 
 def _map(pycolmap: Any, database: Path, images: Path, work: Path, options: Any, free: bool) -> Any:
-    """The reconstruction of most photos with the lenses of the database; None if no pair can be placed.
+    """The reconstruction of most photos with the lenses of the database; None if no pair can be registered.
 
-    If `free`, the second attempt adjusts focal lengths while it places photos.
+    If `free`, the second attempt adjusts focal lengths while it registers photos.
     """
     options.mapper.init_min_tri_angle = _FIRST_PAIR_DEGREES
     options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = False
@@ -242,7 +246,7 @@ def _map(pycolmap: Any, database: Path, images: Path, work: Path, options: Any, 
 
 
 def _map_from(pycolmap: Any, database: Path, images: Path, work: Path, options: Any, start: Any) -> Any:
-    """The reconstruction of the photos whose cameras are known, and of those that its points then place."""
+    """The reconstruction of the photos whose cameras are known, and of those that its points then register."""
     known = work / "start"
     known.mkdir(parents=True, exist_ok=True)
     points = pycolmap.triangulate_points(start, database, images, known, options=options)
@@ -260,14 +264,14 @@ def _started(file: Any, cameras: Cameras, names: Mapping[str, str]) -> Any:
         for image in cameras.reconstruction.images.values():
             if image.has_pose and names.get(image.name) in cameras.rotations:
                 image_id = images[image.name].image_id
-                places = file.read_keypoints(image_id)[:, :2]
-                new = pycolmap.Image(name=image.name, keypoints=places, camera_id=image.camera_id, image_id=image_id)
+                keypoints = file.read_keypoints(image_id)[:, :2]
+                new = pycolmap.Image(name=image.name, keypoints=keypoints, camera_id=image.camera_id, image_id=image_id)
                 scene.add_image_with_trivial_frame(new, image.cam_from_world())
     return scene
 
 
 def _run_mapper(pycolmap: Any, database: Path, images: Path, work: Path, options: Any, start: str | Path = "") -> Any:
-    """The reconstruction that places most photos; None if the mapper finds none. It goes on with the one in `start`."""
+    """The reconstruction with most registered photos; None if there is none. The mapper goes on from `start`."""
     try:
         scenes = pycolmap.incremental_mapping(database, images, work, options, start)
     except (RuntimeError, ValueError):  # the mapper gives up

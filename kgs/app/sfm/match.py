@@ -30,7 +30,7 @@ DEFAULT_FOCAL = 0.8  # of the longer side, if Exif does not say it; phones have 
 class PhotoKeypoints(NamedTuple):
     """Keypoints of one photo, as COLMAP and Kornia take them."""
 
-    places: Tensor  # `(N, 2)` float32, the first pixel's centre is (0.5, 0.5)
+    pixels: Tensor  # `(N, 2)` float32, the first pixel's centre is (0.5, 0.5)
     descriptors: Tensor  # `(N, 128)` float32, RootSIFT
     frames: Tensor  # `(1, N, 2, 3)`, Kornia's local affine frames
 
@@ -39,11 +39,11 @@ def find_keypoints(photo: Photo, max_count: int) -> PhotoKeypoints:
     """The strongest SIFT keypoints of a photo where it is kept, up to `max_count`; nothing is random."""
     factor = 2 if max(photo.size) < SMALL else 1
     keypoints = root_sift(photo.grey(), max_count, factor, photo.mask, contrastThreshold=_CONTRAST)
-    places = (keypoints.places + 0.5).float()
+    pixels = (keypoints.pixels + 0.5).float()
     sizes = keypoints.sizes.float()
     angles = keypoints.angles.float()
-    frames = laf_from_center_scale_ori(places[None], sizes[None, :, None, None], angles[None, :, None])
-    return PhotoKeypoints(places, keypoints.descriptors, frames)
+    frames = laf_from_center_scale_ori(pixels[None], sizes[None, :, None, None], angles[None, :, None])
+    return PhotoKeypoints(pixels, keypoints.descriptors, frames)
 
 
 def write_matches(database: Path, photos: list[Photo], names: list[str], bar: ProgressBar) -> None:
@@ -62,7 +62,7 @@ def write_matches(database: Path, photos: list[Photo], names: list[str], bar: Pr
     with _open(database) as file:
         ids = _write_photos(file, photos, names)
         for image_id, of_photo in zip(ids, keypoints, strict=True):
-            file.write_keypoints(image_id, of_photo.places.numpy())
+            file.write_keypoints(image_id, of_photo.pixels.numpy())
         for i, j in bar(list(combinations(range(len(photos)), 2)), "matches", "pair"):
             pairs = _match(keypoints[i], keypoints[j], area)
             if len(pairs) >= _MIN_MATCHES:
@@ -71,12 +71,12 @@ def write_matches(database: Path, photos: list[Photo], names: list[str], bar: Pr
 
 def _match(first: PhotoKeypoints, second: PhotoKeypoints, area: tuple[int, ...]) -> Tensor:
     """Indices of matching keypoints, `(M, 2)`: mutual nearest neighbours among descriptors that pass AdaLAM."""
-    if min(len(first.places), len(second.places)) < _MIN_MATCHES:
+    if min(len(first.pixels), len(second.pixels)) < _MIN_MATCHES:
         return torch.zeros(0, 2, dtype=torch.int64)
     nearest1 = []
-    best2 = torch.full((len(second.places),), -1.0)
-    nearest2 = torch.zeros(len(second.places), dtype=torch.int64)
-    for start in range(0, len(first.places), _CHUNK):
+    best2 = torch.full((len(second.pixels),), -1.0)
+    nearest2 = torch.zeros(len(second.pixels), dtype=torch.int64)
+    for start in range(0, len(first.pixels), _CHUNK):
         products = first.descriptors[start : start + _CHUNK] @ second.descriptors.T
         nearest1.append(products.argmax(1))
         best, rows = products.max(0)

@@ -31,10 +31,10 @@ from .gates import FOCAL_RANGE, MAX_DEGREES, MAX_RATIO, MIN_POINTS, MIN_RISE
 from .leave_out import unlike_others
 from .map import Cameras, quiet_pycolmap
 from .match import exif_focal
-from .place import IMAGES, MASKS, MODEL, REPORT, check_place, is_reusable
 from .pycolmap_processes import check_space
 from .read import FILM_DIAGONAL, OpenPhoto, Photo, blurred, open_photos, read_photos
 from .video import take_frames
+from .workspace import IMAGES, MASKS, MODEL, REPORT, check_workspace, is_reusable
 from .write import level_and_scale, upright, write_images, write_masks, write_model
 
 SETTINGS = 9  # increased by every change after which the same photos give other files
@@ -98,7 +98,7 @@ def pose_photos(
     with quiet_pycolmap():  # a missing package is an error before any work
         pass
     paths = find_photos(folder)
-    check_place(out, folder)
+    check_workspace(out, folder)
     opened = open_photos(paths, None if masks is None else Path(masks))
     inputs = {
         "settings": SETTINGS,
@@ -109,8 +109,8 @@ def pose_photos(
     out.mkdir(parents=True, exist_ok=True)
     with locked(out):
         complete(out, say)
-        places = (*unpublished(out, "photos"), out)
-        posed = next((place for place in places if is_reusable(place, inputs)), None)
+        folders = (*unpublished(out, "photos"), out)
+        posed = next((path for path in folders if is_reusable(path, inputs)), None)
         is_reused = posed is not None
         if posed is None:
             posed = begin(out, "photos")
@@ -172,17 +172,17 @@ def find_cameras(
             say(f"blurred beside the others: {', '.join(unsharp)}; if the fit shows it, take them again")
         png = png_names(names)
         photo_names = {image: name for name, image in png.items()}
-        places = images, new / MASKS
+        folders = images, new / MASKS
         write_images(images, [photo.upright() for photo in photos], list(png.values()))
         write_masks(new / MASKS, [photo.upright() for photo in photos], list(png.values()))
         turned = {photo.name for photo in photos if photo.is_turned}
         if turned:
-            places = work / IMAGES, work / MASKS
-            places[0].mkdir()
-            write_images(places[0], photos, list(png.values()))
-            write_masks(places[1], photos, list(png.values()))
+            folders = work / IMAGES, work / MASKS
+            folders[0].mkdir()
+            write_images(folders[0], photos, list(png.values()))
+            write_masks(folders[1], photos, list(png.values()))
         lap("photos")
-        found = agreed_cameras(photos, *places, work, photo_names, seed, bar, lap, say)
+        found = agreed_cameras(photos, *folders, work, photo_names, seed, bar, lap, say)
         for name in found.left_out:
             (images / png[name]).unlink()
             (new / MASKS / f"{png[name]}.png").unlink(missing_ok=True)

@@ -69,13 +69,13 @@ def upright(cameras: Cameras, turned: set[str], names: Mapping[str, str]) -> Cam
                 continue
             lens = scene.cameras[image.camera_id]
             is_turned = names[image.name] in turned
-            places = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
+            keypoints = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
             pose = image.cam_from_world()
             if is_turned:
-                places = np.stack([places[:, 1], lens.width - places[:, 0]], 1)
+                keypoints = np.stack([keypoints[:, 1], lens.width - keypoints[:, 0]], 1)
                 pose = back * pose
             camera_id = lens.camera_id + is_turned * count
-            new = pycolmap.Image(name=image.name, keypoints=places, camera_id=camera_id, image_id=image_id)
+            new = pycolmap.Image(name=image.name, keypoints=keypoints, camera_id=camera_id, image_id=image_id)
             found.add_image_with_trivial_frame(new, pose)
         for point_id, point in scene.points3D.items():
             found.add_point3D_with_id(point_id, point)

@@ -66,7 +66,7 @@ _BLOCK = 64
 
 
 @inline
-def place_pixels(pixels):
+def fill_pixels(pixels):
     """X and y of the pixels of a tile about its centre, `(2 P,)`."""
     for p in range(P):
         pixels[p] = f32(p % SIZE) - _CENTRE
@@ -156,7 +156,7 @@ def composite_forward(
     height, width = transmittance.shape[1], transmittance.shape[2]
     F, median = len(channels), len(depths) > 0
     pixels = scratch(2 * P)
-    place_pixels(pixels)
+    fill_pixels(pixels)
     log_threshold = f32(math.log2(threshold))
     found = np.empty(STRIPS, np.int64)
     s = scratch((2 + F) * P)  # T, sums, depth of the last layer before which T was at least one half
@@ -255,7 +255,7 @@ def composite_backward(
     height, width = grad_transmittance.shape[1], grad_transmittance.shape[2]
     F = len(channels)
     pixels = scratch(2 * P)
-    place_pixels(pixels)
+    fill_pixels(pixels)
     g = scratch(F * P)
     behind = scratch(P)  # V behind the layers that are still to come
     layers = scratch(K * ROW)

@@ -82,11 +82,11 @@ class _Projection(torch.autograd.Function):
         ctx.ids = [part[-1].numpy() for part in parts]
         camera_ids = torch.from_numpy(np.repeat(np.arange(len(parts)), [len(x) for x in ctx.ids]))
         by_mean, by_turn, by_scale, by_opacity, by_color, by_pose, by_lens = ctx.needs_input_grad[:7]
-        by_place = by_mean or by_pose
-        by_shape = by_place or by_lens or by_turn or by_scale
-        colored = harmonics and (by_color or (by_place and inputs[4].shape[1] > 1))
+        by_position = by_mean or by_pose
+        by_shape = by_position or by_lens or by_turn or by_scale
+        colored = harmonics and (by_color or (by_position and inputs[4].shape[1] > 1))
         outputs = (means2d, factors, depths, alphas, rgb)
-        differentiable = (by_place or by_lens, by_shape, by_place, by_opacity, colored)
+        differentiable = (by_position or by_lens, by_shape, by_position, by_opacity, colored)
         constant = [x for x, varies in zip(outputs, differentiable, strict=True) if not varies]
         ctx.mark_non_differentiable(*constant, ids, camera_ids, radii, num_nonfinite)
         return *outputs, ids, camera_ids, radii, num_nonfinite

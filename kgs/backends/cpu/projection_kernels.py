@@ -42,7 +42,7 @@ def empty_columns(count):
 
 @inline
 def read(values, g, count, columns, first, i):
-    """Put `count` numbers of row g into place i of columns, `(columns PART,)`."""
+    """Put `count` numbers of row g into slot i of columns, `(columns PART,)`."""
     for j in range(count):
         columns[(first + j) * PART + i] = values[g, j]
 

@@ -115,7 +115,7 @@ def fill_entries(
     columns, begins, tiles, ranks,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """The tiles that each Gaussian reaches, from `begins[i]` on, and beside them its place in depth order.
+    """The tiles that each Gaussian reaches, from `begins[i]` on, and beside them its rank in depth order.
 
     At most as many as were counted: a compiler may round one of the two kernels otherwise, at the edge of a tile.
     """

@@ -15,7 +15,7 @@ from .compositing_kernels import FEATURES, ROW, SIZE, K, composite_backward, com
 from .launch import blocks, launch
 
 _TINY = 2.0**-125  # smaller alphas and T are 0: products with them would be denormal
-# bytes of an entry: tile and rank, both sorted, its place, memory of the sort; its share of T; its row of moments
+# bytes of an entry: tile and rank, both sorted, its slot, memory of the sort; its share of T; its row of moments
 _PER_ENTRY = 4 * (2 + 2 + 2 + 4 + SIZE * SIZE // K + ROW)
 _LANES = 32  # Gaussians of a program that goes through their tiles
 
@@ -35,7 +35,7 @@ class _Lists:
     """The lists of a row slice, and what its forward pass left; the tensors are those of `.compositing_kernels`."""
 
     entries: Tensor
-    places: Tensor
+    slots: Tensor
     offsets: Tensor
     starts: Tensor
     reached: Tensor
@@ -98,7 +98,7 @@ class GpuCompositor(Compositor):
         def add(rows: _Rows, lists: _Lists) -> None:
             """Add the gradients of a row slice; what it needs is freed before the next is made."""
             later_slice = rows is not self._slices[0]
-            tiles = (lists.entries, lists.places, lists.offsets, *self._tiles(rows), channels, *self._thresholds)
+            tiles = (lists.entries, lists.slots, lists.offsets, *self._tiles(rows), channels, *self._thresholds)
             given = (self._table, features, self._order, *tiles, lists.starts, lists.reached, grads, behind)
             moments = features.new_zeros(rows.entries, ROW)
             for first in self._features:
@@ -153,9 +153,9 @@ class GpuCompositor(Compositor):
         ranks = self._order.new_empty(rows.entries, dtype=torch.int32)
         where = (rows.begin, rows.end, n, self._columns, rows.begins, keys, ranks)  # as many as were counted, or fewer
         launch(fill_entries, (blocks(n, _LANES),), *self._ellipses, *where, BLOCK=_LANES, warps=1)
-        keys, places = torch.sort(keys, stable=True)
+        keys, slots = torch.sort(keys, stable=True)
         offsets = torch.searchsorted(keys, torch.arange(tiles + 1, dtype=kind, device=keys.device))
-        entries = ranks.index_select(0, places)
+        entries = ranks.index_select(0, slots)
         chunks = rows.entries // K + tiles if keep else 0
         starts = features.new_empty(chunks, SIZE * SIZE)
         reached = self._order.new_empty(tiles, dtype=torch.int32)
@@ -169,4 +169,4 @@ class GpuCompositor(Compositor):
             MEDIAN=images is not None and self._median_depth,
             warps=1,
         )
-        return _Lists(entries, places, offsets, starts, reached)
+        return _Lists(entries, slots, offsets, starts, reached)

@@ -11,8 +11,8 @@ Arrays, for M projected Gaussians, T tiles and E entries:
     table        (M, 8)   in depth order: log2 o, x, y, two whitening vectors, depth
     features     (M, F)   as they were given
     order        (M,)     their rows in depth order
-    entries      (E,)     for each tile its Gaussians from front to back, as places in `order`
-    places       (E,)     which place each entry has if they are sorted by Gaussian
+    entries      (E,)     for each tile its Gaussians from front to back, as positions in `order`
+    slots        (E,)     which slot each entry has if they are sorted by Gaussian
     offsets      (T + 1,) where the entries of each tile begin
     starts       (E / K + T, P) T at the beginning of each chunk
     reached      (T,)     how many entries of a tile were composited
@@ -165,7 +165,7 @@ def composite_forward(
 
 @triton.jit(do_not_specialize=["first_tile", "f0"])
 def composite_backward(
-    table, features, order, entries, places, offsets, first_tile, columns, rows, height, width, channels, threshold,
+    table, features, order, entries, slots, offsets, first_tile, columns, rows, height, width, channels, threshold,
     stop, starts, reached, grads, grad_transmittance, f0, moments,
     ABSOLUTE: tl.constexpr,
 ):  # fmt: skip
@@ -209,7 +209,7 @@ def composite_backward(
         behind = tl.sum(tl.where(k[:, None] == 0, m * behind[None, :] + b, 0.0), 0)
         slope = tl.where(alpha < _ALPHA_MAX, weight * (value - later), 0.0)
         by_x, by_y = slope * dx, slope * dy
-        out = moments + tl.load(places + e + k, mask=listed, other=0) * _ROW
+        out = moments + tl.load(slots + e + k, mask=listed, other=0) * _ROW
         tl.store(out, tl.sum(slope, 1), mask=listed)
         tl.store(out + 1, tl.sum(by_x, 1), mask=listed)
         tl.store(out + 2, tl.sum(by_y, 1), mask=listed)

@@ -45,7 +45,7 @@ def _mirror(i, length):
 
 @triton.jit
 def _folded(maps, base, i, stride, length, mask, t0, t1, t2, t3, t4, t5):
-    """The adjoint of the window along one axis, with what the border mirrored: at place i of lines of some length."""
+    """The adjoint of the window along one axis, with what the border mirrored: at index i of lines of some length."""
     total = (i * 0).to(tl.float32)
     for j in tl.static_range(11):
         weight = _tap(t0, t1, t2, t3, t4, t5, j)

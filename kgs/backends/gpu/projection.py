@@ -59,7 +59,7 @@ class _Visible:
     """Which pairs (camera, Gaussian) are visible."""
 
     cameras: Tensor  # (C, WIDTH), a row of numbers for each camera, see `.camera_kernels`
-    places: Tensor  # (C N,), how many pairs are visible up to and including each
+    running_counts: Tensor  # (C N,), how many pairs are visible up to and including each
     counts: list[int]  # how many Gaussians each camera sees
     num_nonfinite: Tensor  # 0-d
 
@@ -81,12 +81,12 @@ def _find_visible(
     flags = finite.new_empty(len(rows), n, dtype=torch.int32)
     frustum = (cutoff, options.near_plane, options.eps2d, *size)
     launch(find_visible, (blocks(n, _BLOCK), len(rows)), *values, finite, rows, *frustum, n, flags, BLOCK=_BLOCK)
-    places = torch.cumsum(flags.view(-1), 0)
-    *ends, covered = torch.cat([places[n - 1 :: n], rows[:, COVERED].amin().long()[None]]).tolist()
+    running_counts = torch.cumsum(flags.view(-1), 0)
+    *ends, covered = torch.cat([running_counts[n - 1 :: n], rows[:, COVERED].amin().long()[None]]).tolist()
     if not covered:
         return None
     counts = [end - begin for begin, end in pairwise([0, *ends])]
-    return _Visible(rows, places, counts, n - finite.sum())
+    return _Visible(rows, running_counts, counts, n - finite.sum())
 
 
 def _describe(cameras: PinholeCamera, size: tuple[int, int], options: RasterOptions) -> Tensor:
@@ -121,16 +121,16 @@ class _Projection(torch.autograd.Function):
         bands = colors.shape[1] if harmonics else 0
         widths = ((2,), (2, 3), (), (), (3 if harmonics else 0,), ())
         fields = [means.new_empty(count, *width) for width in widths]
-        camera_ids, ids = (visible.places.new_empty(count) for _ in range(2))
+        camera_ids, ids = (visible.running_counts.new_empty(count) for _ in range(2))
         values = [x.contiguous() for x in (means, quats, scales, opacities, colors)]
-        options = (visible.cameras, visible.places, near, eps2d, n, opacities.numel() // n)
+        options = (visible.cameras, visible.running_counts, near, eps2d, n, opacities.numel() // n)
         grid = (blocks(n, _BLOCK), len(visible.cameras))
         launch(list_visible, grid, *values, *options, *fields, camera_ids, ids, BANDS=bands, BLOCK=_BLOCK)
         by_mean, by_turn, by_scale, by_opacity, by_color, by_pose, by_lens = ctx.needs_input_grad[:7]
-        by_place = by_mean or by_pose
-        by_shape = by_place or by_lens or by_turn or by_scale
-        colored = harmonics and (by_color or (by_place and bands > 1))
-        differentiable = (by_place or by_lens, by_shape, by_place, by_opacity, colored, False)
+        by_position = by_mean or by_pose
+        by_shape = by_position or by_lens or by_turn or by_scale
+        colored = harmonics and (by_color or (by_position and bands > 1))
+        differentiable = (by_position or by_lens, by_shape, by_position, by_opacity, colored, False)
         constant = [x for x, varies in zip(fields, differentiable, strict=True) if not varies]
         ctx.mark_non_differentiable(*constant, camera_ids, ids)
         return *fields, camera_ids, ids
@@ -157,7 +157,7 @@ class _Projection(torch.autograd.Function):
             launch(
                 footprint_gradients,
                 (count,),
-                *(c, *values, cameras, ctx.visible.places, n, views, *incoming, *input_grads, totals),
+                *(c, *values, cameras, ctx.visible.running_counts, n, views, *incoming, *input_grads, totals),
                 BANDS=colors.shape[1] if ctx.harmonics else 0,
                 WITH_COLORS=needs[4],
                 WITH_CAMERA=any(needs[5:]),

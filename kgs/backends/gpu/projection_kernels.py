@@ -3,9 +3,9 @@
 The formulas are those of `kgs.projection`, `kgs.camera` and `kgs.covariance`; a camera is a row of numbers, see
 :mod:`.camera_kernels`. Arrays of N Gaussians and C cameras:
 
-    opacities   (1, N) or (C, N)
-    finite      (N,)      whether all of a Gaussian's numbers are
-    places      (C, N)    how many pairs are visible up to and including this one: that of a visible pair is its row + 1
+    opacities       (1, N) or (C, N)
+    finite          (N,)      whether all of a Gaussian's numbers are
+    running_counts  (C, N)    how many pairs are visible up to and including this one: of a visible pair, its row + 1
 """
 
 import triton
@@ -184,18 +184,18 @@ def _direction(camera, mx, my, mz):
 
 @triton.jit
 def list_visible(
-    means, quats, scales, opacities, colors, cameras, places, near, eps2d, n, views, means2d, factors, depths, alphas,
-    rgb, radii, camera_ids, ids,
+    means, quats, scales, opacities, colors, cameras, running_counts, near, eps2d, n, views, means2d, factors, depths,
+    alphas, rgb, radii, camera_ids, ids,
     BANDS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Write what is visible to its row: the fields of `kgs.ProjectedGaussians`."""
     c = tl.program_id(1)
     camera = cameras + c * _WIDTH
     g = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    place = c * n + g
+    pair = c * n + g
     inside = g < n
-    end = tl.load(places + place, mask=inside, other=0)
-    visible = inside & (end > tl.load(places + place - 1, mask=inside & (place > 0), other=0))
+    end = tl.load(running_counts + pair, mask=inside, other=0)
+    visible = inside & (end > tl.load(running_counts + pair - 1, mask=inside & (pair > 0), other=0))
     m = end - 1
     _, z, u, v, a0, a1, a2, b0, b1, b2 = _footprint(camera, means, quats, scales, g, visible, near)
     xx, xy, yy, _ = variances(a0, a1, a2, b0, b1, b2, eps2d)
@@ -333,7 +333,7 @@ def _pose_totals(out, i: tl.constexpr, camera, moved, j, h, mx, my, mz, u0, u1, 
 
 @triton.jit(do_not_specialize=["c"])
 def footprint_gradients(
-    c, means, quats, scales, colors, cameras, places, n, views, g_means2d, g_factors, g_depths, g_alphas, g_rgb,
+    c, means, quats, scales, colors, cameras, running_counts, n, views, g_means2d, g_factors, g_depths, g_alphas, g_rgb,
     d_means, d_quats, d_scales, d_opacities, d_colors, totals,
     BANDS: tl.constexpr, WITH_COLORS: tl.constexpr, WITH_CAMERA: tl.constexpr, ADD: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -344,10 +344,10 @@ def footprint_gradients(
     b = tl.program_id(0)
     camera = cameras + c * _WIDTH
     g = b * BLOCK + tl.arange(0, BLOCK)
-    place = c * n + g
+    pair = c * n + g
     inside = g < n
-    end = tl.load(places + place, mask=inside, other=0)
-    visible = inside & (end > tl.load(places + place - 1, mask=inside & (place > 0), other=0))
+    end = tl.load(running_counts + pair, mask=inside, other=0)
+    visible = inside & (end > tl.load(running_counts + pair - 1, mask=inside & (pair > 0), other=0))
     m = end - 1
     mx, my, mz, x, y, z = _camera_point(camera, means, g, visible)
     z = tl.where(visible, z, 1.0)

@@ -32,7 +32,7 @@ class TileLists:
     offsets: Tensor  # (T + 1,) int64; the entries of tile t are offsets[t]:offsets[t + 1]
     entries: Tensor  # (E,) int32, position in `ids`, sorted by tile and then from front to back
     ids: Tensor  # (n,) int64, the rows of `ProjectedGaussians` that may have entries, in depth order
-    order: Tensor  # (E,) int64, which place each entry has if they are sorted by `ids` first and then by tile
+    order: Tensor  # (E,) int64, which position each entry has if they are sorted by `ids` first and then by tile
 
     @property
     def num_tiles(self) -> int:

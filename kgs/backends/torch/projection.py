@@ -101,15 +101,15 @@ def _project_one(
         visible, radii, overflows = frustum.touch(means2d, factors)
         if bool(overflows.any()):  # these must not take part at all: their gradients would not be finite
             ids, visible, radii = (select_rows(x, (~overflows).nonzero()[:, 0]) for x in (ids, visible, radii))
-        places = visible.nonzero()[:, 0]
+        visible_rows = visible.nonzero()[:, 0]
     if ids.shape[0] != means.shape[0]:
         means, points, means2d, factors = footprints(ids)
     opacities = gaussians.opacities if gaussians.opacities.ndim == 1 else gaussians.opacities[c]
-    ids = select_rows(ids, places)
-    radii = select_rows(radii, places)
+    ids = select_rows(ids, visible_rows)
+    radii = select_rows(radii, visible_rows)
     rgb = select_rows(gaussians.colors, ids) if colors else means.new_zeros(ids.shape[0], 0)
     if rgb.ndim == 3:
-        directions = view_directions(select_rows(means, places), lens.extrinsics, lens.parallel)
+        directions = view_directions(select_rows(means, visible_rows), lens.extrinsics, lens.parallel)
         rgb = evaluate_harmonics(rgb, directions)
-    means2d, factors, depths = (select_rows(x, places) for x in (means2d, factors, points[:, 2]))
+    means2d, factors, depths = (select_rows(x, visible_rows) for x in (means2d, factors, points[:, 2]))
     return ids, means2d, factors, depths, radii, select_rows(opacities, ids), rgb

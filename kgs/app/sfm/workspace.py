@@ -14,7 +14,7 @@ MASKS = "masks"
 MODEL = "sparse/0"
 
 
-def check_place(out: Path, folder: Path) -> None:
+def check_workspace(out: Path, folder: Path) -> None:
     """Raise a DataError if results would lie among the user's photos, or in the folder of another scene."""
     photos = folder.resolve()
     results = [out / IMAGES, out / MASKS, out / "sparse"]
