@@ -315,10 +315,10 @@ def _views(
     views = []
     for j, scale in enumerate(scales):
         opaque = torch.ones(1, *scale.size, dtype=torch.float32)
-        alpha = torch.stack([alphas[j].get(i, opaque) for i in range(count)]) if alphas[j] else None
+        mask = torch.stack([alphas[j].get(i, opaque) for i in range(count)]) if alphas[j] else None
         every = opaque[0] > 0
         rows = torch.stack([valid[j].get(i, every) for i in range(count)]) if valid[j] else None
         cameras = pinholes(intrinsics[j], extrinsics, scale.size)
         kinds = tuple(turned) if any(turned) else None
-        views.append(Views(cameras, images[j], names, alpha, valid_mask=rows, turned=kinds))
+        views.append(Views(cameras, images[j], names, mask, valid_mask=rows, turned=kinds))
     return views
