@@ -29,7 +29,7 @@ def test_a_point_projects_to_the_same_position_in_a_halved_picture(size):
     full = views(*size)
     half = full.downsample(2)
     assert half.images.shape == (2, 3, size[0] // 2, size[1] // 2)
-    assert half.masks.shape == (2, 1, size[0] // 2, size[1] // 2)
+    assert half.alphas.shape == (2, 1, size[0] // 2, size[1] // 2)
     points = torch.tensor([[[0.1, -0.2, 3.0]], [[-0.3, 0.1, 2.0]]])
     on_full, on_half = full.cameras.project(points), half.cameras.project(points)
     # pixel k of the halved picture covers pixels 2k and 2k + 1, whose middle is 2k + 1/2
@@ -132,7 +132,7 @@ def check_float32(scene):
         *([scene.train_full_size] if scene.train_full_size else []),
     ):
         tensors = [part.images, part.cameras.intrinsics, part.cameras.extrinsics, part.cameras.height, part.cameras.fx]
-        tensors += [part.camera([0]).width] + ([] if part.masks is None else [part.masks])
+        tensors += [part.camera([0]).width] + ([] if part.alphas is None else [part.alphas])
         assert {(tensor.dtype, tensor.device.type) for tensor in tensors} == {(torch.float32, "cpu")}
         assert part.select([0]).images.device.type == "cpu"
     assert {t.dtype for t in (scene.points, scene.point_colors, scene.background)} == {torch.float32}
