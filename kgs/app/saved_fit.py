@@ -15,6 +15,7 @@ from kgs.backends import former_or_auto
 from kgs.datasets.scene import Scene
 from kgs.fit.checkpoint import newest_checkpoint
 from kgs.fit.config import FitConfig
+from kgs.fit.decisions import Decisions
 from kgs.fit.exposure import with_exposure
 from kgs.fit.fit import Fit
 from kgs.fit.poses import with_extrinsics
@@ -95,7 +96,7 @@ def _read_model(path: Path, values: dict[str, Any]) -> GaussianModel:
 def _exposed(scene: Scene, path: Path, values: dict[str, Any]) -> Scene:
     """The scene, with the gains of the training photos that were decided."""
     try:
-        return with_exposure(scene, values.get("decisions", {}))
+        return with_exposure(scene, Decisions.from_dict(values.get("decisions", {})))
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(path, "decisions", f"expected the gains of {len(scene.train)} photos, got others") from error
 

@@ -14,7 +14,6 @@ gains are used only where photos differ much, and gains explain it (docs/photos.
 """
 
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,6 +23,7 @@ from kgs.datasets.scene import Scene
 from kgs.init_points import InitialPoints
 from kgs.init_points.patches import MIN_PATCHES, PatchColors
 
+from .decisions import Decisions, ExposureDecision
 from .plan import Plan
 
 MIN_RATIO = 1.3  # between the gains of two photos in a channel, for gains to be used
@@ -41,9 +41,7 @@ def decide_exposure(plan: Plan, points: InitialPoints) -> Plan:
         points: its initial points; without patches there are no gains, and a warning if they were asked for.
 
     Returns:
-        The plan. If gains are used, its `decisions` have under "exposure" a dict: "gains", three numbers for each
-        training view, with a geometric mean of 1; "left", the share of the patches' differences that they leave; and
-        "n", the number of patches.
+        The plan. If gains are used, `decisions.exposure` has them.
     """
     how = plan.config.exposure
     if how == "same":
@@ -57,8 +55,8 @@ def decide_exposure(plan: Plan, points: InitialPoints) -> Plan:
     if how == "auto" and (ratio < MIN_RATIO or left > MAX_LEFT):
         return plan
     rows = [[round(value, 4) for value in row] for row in gains.tolist()]
-    exposure = {"gains": rows, "left": round(left, 3), "n": len(points.patches)}
-    return replace(plan, decisions={**plan.decisions, "exposure": exposure})
+    exposure = ExposureDecision(gains=rows, left=round(left, 3), n=len(points.patches))
+    return replace(plan, decisions=replace(plan.decisions, exposure=exposure))
 
 
 def estimate_gains(patches: PatchColors) -> tuple[Tensor, float]:
@@ -101,14 +99,13 @@ def _solve(weights: Tensor, logs: Tensor) -> Tensor:
     return found - found.mean()
 
 
-def with_exposure(scene: Scene, decisions: dict[str, Any]) -> Scene:
+def with_exposure(scene: Scene, decisions: Decisions) -> Scene:
     """The scene whose training views have the gains that were decided; the same one where none were.
 
     Raises:
         ValueError: they are not three numbers above 0 for each view.
     """
-    if "exposure" not in decisions:
+    if decisions.exposure is None:
         return scene
-    views = scene.train
-    gains = torch.tensor(decisions["exposure"]["gains"], dtype=torch.float32)
-    return replace(scene, train=replace(views, gains=gains))
+    gains = torch.tensor(decisions.exposure.gains, dtype=torch.float32)
+    return replace(scene, train=replace(scene.train, gains=gains))

@@ -17,6 +17,7 @@ from kgs.renderer import GaussianRenderer, blend
 from kgs.types import RasterOptions
 
 from .config import FitConfig
+from .decisions import Decisions
 from .targets import background_of
 
 
@@ -30,7 +31,8 @@ class Fit:
         options: of the renderer.
         backend: of the renderer.
         settings: of the fit; None for a splat that is not one of kgs.
-        history: plain values for metrics.json: "steps", "seconds", "curve", "init", "decisions", "poses".
+        history: plain values for metrics.json: "steps", "seconds", "curve", "init", "poses".
+        decisions: what was decided about it, and why.
         metrics: the content of metrics.json, once it is measured.
         notes: lines that a user should read.
         part: which of the trained Gaussians `model` has, after pruning: "rows", bool, and "sh_degree".
@@ -42,6 +44,7 @@ class Fit:
     backend: str = "auto"
     settings: FitConfig | None = None
     history: dict[str, Any] = field(default_factory=dict)
+    decisions: Decisions = field(default_factory=Decisions)
     metrics: dict[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     part: dict[str, Any] = field(default_factory=dict)

@@ -12,6 +12,7 @@ from kgs.init_points import InitialPoints
 from kgs.init_points.patches import MIN_PATCHES, PatchColors
 
 from .config import DROP
+from .decisions import OverlapDecision
 from .plan import FEW, Plan
 
 STEPS_OF_A_PHOTO = 275  # steps for each photo beyond the third that shows a patch of surface
@@ -46,9 +47,8 @@ def decide_by_overlap(plan: Plan, points: InitialPoints) -> Plan:
         points: its initial points.
 
     Returns:
-        The plan with a rate, and with a number of steps. If the patches decided, its `decisions` have under "overlap" a
-        dict: the numbers of :class:`Overlap`, "patches" (how many there are), and of "steps" and "drop" those that were
-        decided. Without patches the rate is `DROP`, and the fit has the usual length.
+        The plan with a rate, and with a number of steps. If the patches decided, `decisions.overlap` says by what.
+        Without patches the rate is `DROP`, and the fit has the usual length.
     """
     is_open = [name for name in ("steps", "drop") if getattr(plan.config, name) is None]
     if not is_open:
@@ -56,12 +56,12 @@ def decide_by_overlap(plan: Plan, points: InitialPoints) -> Plan:
     patches = points.patches
     if patches is None or len(patches) < MIN_PATCHES:
         usual = {"steps": plan.schedule.steps, "drop": DROP}
-        return plan.decided({name: usual[name] for name in is_open}, {})
+        return plan.decided({name: usual[name] for name in is_open})
     overlap = Overlap.of(patches)
     chosen = {"steps": steps_for(overlap.views_per_patch), "drop": drop_rate_for(overlap.views_per_pair)}
     entries = {name: chosen[name] for name in is_open}
     numbers = {name: round(number, 2) for name, number in overlap._asdict().items()}
-    return plan.decided(entries, {"overlap": {**numbers, "patches": len(patches), **entries}})
+    return plan.decided(entries, overlap=OverlapDecision(**numbers, patches=len(patches), **entries))
 
 
 def steps_for(views_per_patch: float) -> int:

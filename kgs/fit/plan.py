@@ -13,6 +13,7 @@ from kgs.init_points.dense import FEW_VIEWS
 from kgs.types import check_kind
 
 from .config import FitConfig
+from .decisions import Decisions
 
 
 class Schedule(NamedTuple):
@@ -50,19 +51,20 @@ class Plan:
         device: of the fit.
         backend: "numba", "triton" or "torch".
         schedule: the steps at which things happen.
-        decisions: what was decided about the scene, and why, for metrics.json.
+        decisions: what was decided about the scene, and why.
     """
 
     config: FitConfig
     device: torch.device
     backend: str
     schedule: Schedule
-    decisions: dict[str, Any] = field(default_factory=dict)
+    decisions: Decisions = field(default_factory=Decisions)
 
-    def decided(self, entries: dict[str, Any], decisions: dict[str, Any]) -> Self:
-        """The plan with these entries of its configuration; why they were decided goes into `decisions`."""
+    def decided(self, entries: dict[str, Any], **decisions: Any) -> Self:
+        """The plan with these entries of its configuration; `decisions` say by name why, see :class:`Decisions`."""
         config = replace(self.config, **entries)
-        return replace(self, config=config, schedule=make_schedule(config), decisions={**self.decisions, **decisions})
+        made = replace(self.decisions, **decisions)
+        return replace(self, config=config, schedule=make_schedule(config), decisions=made)
 
 
 def make_plan(scene: Scene, config: FitConfig) -> Plan:

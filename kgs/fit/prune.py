@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,6 +14,7 @@ from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 from kgs.types import RasterOptions
 
+from .decisions import Decisions, PruningDecision
 from .fit import Fit
 
 TOLERANCE = 0.01  # dB by which the PSNR of a training view may change
@@ -29,8 +29,7 @@ def prune(fit: Fit) -> Fit:
     Takes the highest limit of `WEIGHTS` that changes the PSNR of no training view by more than `TOLERANCE`, then the
     lowest degree of harmonics for which the same holds and which changes no pixel value by more than `QUANTUM`.
 
-    The history's "decisions" then have under "gaussians" how many were "fitted" and "kept", the limit "weight", and
-    "sh_degree".
+    `decisions.gaussians` of the pruned fit says how many were kept.
     """
     if fit.settings is not None and not fit.settings.prune:
         return fit
@@ -43,14 +42,8 @@ def prune(fit: Fit) -> Fit:
         if _is_as_good(pruned, levels):
             break
     pruned = _with_fewest_harmonics(fit, pruned, levels)
-    record = {
-        "fitted": len(model),
-        "kept": len(pruned.model),
-        "weight": limit,
-        "sh_degree": pruned.part["sh_degree"],
-    }
-    decisions = {**fit.history["decisions"], "gaussians": record}
-    return replace(pruned, history={**fit.history, "decisions": decisions})
+    kept = PruningDecision(len(model), len(pruned.model), limit, pruned.part["sh_degree"])
+    return replace(pruned, decisions=replace(fit.decisions, gaussians=kept))
 
 
 def _part(fit: Fit, rows: Tensor, sh_degree: int) -> Fit:
@@ -102,20 +95,18 @@ def contributions(model: GaussianModel, views: Views, options: RasterOptions, ba
     return torch.zeros_like(colors[:, 0]) if colors.grad is None else colors.grad[:, 0]
 
 
-def left_out(decisions: dict[str, Any]) -> str:
+def left_out(decisions: Decisions) -> str:
     """What a fit left out, in words for the last line of its output; "" if that is nothing."""
     parts = []
-    harmonics = decisions.get("sh_degree")
-    gaussians = decisions.get("gaussians")
-    if harmonics and harmonics["chosen"] == 0:
-        why = harmonics.get("why", "by rule")
-        if harmonics["by"] == "photos":
-            why = f"they can gain {harmonics['gain']:+.2f} dB"
-        parts.append(f"harmonics ({why})")
-    overlap = decisions.get("overlap")
-    if overlap and overlap.get("drop") == 0:
-        parts.append(f"dropping (two patches of surface are shown together by {overlap['views_per_pair']:.1f} photos)")
-    if gaussians and gaussians["kept"] < gaussians["fitted"]:
-        share = 1 - gaussians["kept"] / gaussians["fitted"]
+    degree = decisions.sh_degree
+    if degree is not None and degree.chosen == 0:
+        why = degree.why if degree.gain is None else f"they can gain {degree.gain:+.2f} dB"
+        parts.append(f"harmonics ({why or 'by rule'})")
+    overlap = decisions.overlap
+    if overlap is not None and overlap.drop == 0:
+        parts.append(f"dropping (two patches of surface are shown together by {overlap.views_per_pair:.1f} photos)")
+    gaussians = decisions.gaussians
+    if gaussians is not None and gaussians.kept < gaussians.fitted:
+        share = 1 - gaussians.kept / gaussians.fitted
         parts.append(f"{100 * share:.0f} % of the Gaussians (next to no contribution to a training view)")
     return ", ".join(parts)

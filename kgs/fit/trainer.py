@@ -30,6 +30,7 @@ from kgs.types import Gaussians, RasterOptions, Rendering, check_kind
 
 from .checkpoint import newest_checkpoint, previous, save_checkpoint
 from .config import FitConfig
+from .decisions import Decisions
 from .divergence import bound_scales, gradient_fault, parameter_fault, scale_fault, step_fault
 from .exposure import with_exposure
 from .fit import Fit
@@ -147,9 +148,9 @@ class Trainer:
                 "seconds": round(state.seconds, 2),
                 "curve": state.curve,
                 "init": state.start.init,
-                "decisions": self.plan.decisions,
                 "poses": None if state.poses is None else state.poses.moved(),
             },
+            decisions=self.plan.decisions,
             notes=tuple(state.notes),
         )
 
@@ -212,7 +213,7 @@ class Trainer:
         return self.state.to_dict() | {
             "config": self.plan.config.to_dict(),
             "backend": self.plan.backend,
-            "decisions": self.plan.decisions,
+            "decisions": self.plan.decisions.to_dict(),
             "scene": self._fingerprint,
         }
 
@@ -232,9 +233,10 @@ class Trainer:
             longer = check_saved(values, self._fingerprint, plan.config, plan.schedule.steps)
             runs = next(x for x in BACKENDS if x.name == values["backend"]).runs_on(plan.device)
             backend = resolve(values["backend"] if runs else "auto", plan.device)
-            exposed = with_exposure(self._input_scene, values["decisions"])
+            decisions = Decisions.from_dict(values["decisions"])
+            exposed = with_exposure(self._input_scene, decisions)
         state = TrainState.from_dict(self._input_scene, plan, values)
-        self.plan = replace(plan, backend=backend, decisions=values["decisions"])
+        self.plan = replace(plan, backend=backend, decisions=decisions)
         state.notes += longer
         self._use(state, exposed)
 

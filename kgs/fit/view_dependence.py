@@ -19,6 +19,7 @@ from kgs.datasets.splits import select_evenly
 from kgs.init_points import InitialPoints
 from kgs.init_points.patches import MIN_PATCHES, PatchColors
 
+from .decisions import DegreeDecision
 from .plan import Plan
 
 DEGREE = 3  # of the harmonics that are chosen
@@ -39,9 +40,7 @@ def decide_degree(plan: Plan, points: InitialPoints) -> Plan:
         points: its initial points; without patches of at least four views the degree is 0.
 
     Returns:
-        The plan with a degree. Its `decisions` have under "sh_degree" a dict: "chosen"; "by", "rule" or "photos"; for a
-        rule "why"; for photos "over" (the other degree), "gain" (how many dB harmonics can add to a fit of 25 dB) and
-        "n" (the number of patches).
+        The plan with a degree; `decisions.sh_degree` says why.
     """
     if plan.config.sh_degree is not None:
         return plan
@@ -55,9 +54,9 @@ def decide_degree(plan: Plan, points: InitialPoints) -> Plan:
     else:
         gain = possible_gain(patches)
         chosen = DEGREE if gain > MIN_GAIN else 0
-        found = {"by": "photos", "over": DEGREE - chosen, "gain": round(gain, 3), "n": len(patches)}
-        return plan.decided({"sh_degree": chosen}, {"sh_degree": {"chosen": chosen, **found}})
-    return plan.decided({"sh_degree": 0}, {"sh_degree": {"chosen": 0, "by": "rule", "why": why}})
+        found = DegreeDecision(chosen, "photos", over=DEGREE - chosen, gain=round(gain, 3), n=len(patches))
+        return plan.decided({"sh_degree": chosen}, sh_degree=found)
+    return plan.decided({"sh_degree": 0}, sh_degree=DegreeDecision(0, "rule", why))
 
 
 def possible_gain(patches: PatchColors) -> float:

@@ -94,7 +94,7 @@ def fit_and_measure(
         "cpu_seconds": round(cpu_seconds, 2),
         "curve": fit.history["curve"],
         "gaussians": len(fit.model),
-        "decisions": fit.history["decisions"],
+        "decisions": fit.decisions.to_dict(),
         "config": plan.config.to_dict() | ({} if rival is None else asdict(rival)),
         "seen": fit.metrics["seen"],
         "wall_seconds": fit.history["seconds"],

@@ -13,6 +13,7 @@ import torch
 from kgs import RasterOptions
 from kgs.datasets import synthetic_scene
 from kgs.fit.config import PAPER, PRESETS, FitConfig, Recipe
+from kgs.fit.decisions import Decisions, DegreeDecision
 from kgs.fit.plan import expected_memory, gaussian_limit, make_plan, make_schedule, with_step_defaults
 
 
@@ -120,16 +121,16 @@ def test_a_plan_has_what_the_configuration_leaves_open_but_for_the_degree():
     assert plan.config == with_step_defaults(FitConfig(seed=3), 2)
     assert plan.config.sh_degree is None
     assert plan.schedule == make_schedule(plan.config)
-    assert (plan.device, plan.decisions) == (torch.device("cpu"), {})
+    assert (plan.device, plan.decisions) == (torch.device("cpu"), Decisions())
     assert plan.backend in ("numba", "torch")
 
 
 def test_a_degree_changes_the_schedule_and_says_why():
     first = make_plan(SCENE, FitConfig(steps=100))
-    plan = first.decided({"sh_degree": 2}, {"sh_degree": {"by": "rule"}})
+    plan = first.decided({"sh_degree": 2}, sh_degree=DegreeDecision(2, "rule"))
     assert (plan.config.sh_degree, len(plan.schedule.sh)) == (2, 2)
-    assert plan.decisions == {"sh_degree": {"by": "rule"}}
-    assert (first.config.sh_degree, first.schedule.sh, first.decisions) == (None, (), {})
+    assert plan.decisions.to_dict() == {"sh_degree": {"chosen": 2, "by": "rule"}}
+    assert (first.config.sh_degree, first.schedule.sh, first.decisions) == (None, (), Decisions())
 
 
 def test_more_gaussians_or_pixels_take_more_memory():

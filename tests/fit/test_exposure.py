@@ -12,6 +12,7 @@ from kgs.app.page import fit_page
 from kgs.datasets import synthetic_scene
 from kgs.fit import Fit
 from kgs.fit.config import PRESETS, FitConfig
+from kgs.fit.decisions import Decisions, ExposureDecision
 from kgs.fit.exposure import MIN_RATIO, decide_exposure, estimate_gains, with_exposure
 from kgs.fit.measures import measure
 from kgs.fit.plan import make_plan
@@ -75,9 +76,9 @@ def test_gains_are_used_only_where_photos_differ(tiny_plan):
     warm = torch.ones(4, 3)
     warm[0, 0] = 1.1 * MIN_RATIO
     each = replace(tiny_plan, config=replace(tiny_plan.config, exposure="each"))
-    assert "exposure" in decide_exposure(each, points_with(patches(equal))).decisions
-    decisions = decide_exposure(tiny_plan, points_with(patches(warm))).decisions["exposure"]
-    torch.testing.assert_close(torch.tensor(decisions["gains"]), centred(warm), rtol=5e-3, atol=0.0)
+    assert decide_exposure(each, points_with(patches(equal))).decisions.exposure is not None
+    decision = decide_exposure(tiny_plan, points_with(patches(warm))).decisions.exposure
+    torch.testing.assert_close(torch.tensor(decision.gains), centred(warm), rtol=5e-3, atol=0.0)
 
 
 # -- of a scene -----------------------------------------------------------------------------------------------------
@@ -128,7 +129,7 @@ def test_a_fit_without_its_history_cannot_be_measured(fit):
 def test_the_presets_of_the_paper_have_none(exposed):
     for name in ("paper", "plain"):
         config = PRESETS[name]
-        assert "exposure" not in decide(make_plan(exposed, config), choose_points(exposed, config)).decisions
+        assert decide(make_plan(exposed, config), choose_points(exposed, config)).decisions.exposure is None
 
 
 def test_resumed_is_bit_identical(exposed, tmp_path):
@@ -148,7 +149,7 @@ def test_resumed_is_bit_identical(exposed, tmp_path):
 
 def test_gains_of_another_number_of_photos_are_refused(arc):
     with pytest.raises(ValueError, match="gains"):
-        with_exposure(arc, {"exposure": {"gains": [[1.0, 1.0, 1.0]]}})
+        with_exposure(arc, Decisions(exposure=ExposureDecision([[1.0, 1.0, 1.0]], 0.1, 500)))
     with pytest.raises(ValueError, match="gains"):
         replace(arc.train, gains=torch.zeros(6, 3))
 
@@ -199,7 +200,7 @@ def see_through(request):
     gains = GAIN.repeat(len(train), 1)
     scene = replace(scene, train=replace(train, gains=gains), test=test, background=behind)
     config = FitConfig(steps=1, evaluations=1)
-    history = {"decisions": {}, "init": {"kind": "dense", "points": 60}, "poses": None}
+    history = {"init": {"kind": "dense", "points": 60}, "poses": None}
     return Fit(scene, model, RasterOptions(), settings=config, history=history)
 
 
@@ -219,7 +220,7 @@ def test_a_background_that_shows_through_is_not_exposed_in_the_curve_and_in_pict
     scene = see_through.scene
     bare = replace(scene, train=replace(scene.train, gains=None))
     plan = make_plan(bare, see_through.settings)
-    decisions = {"exposure": {"gains": scene.train.gains.tolist()}}
+    decisions = Decisions(exposure=ExposureDecision(scene.train.gains.tolist(), 0.1, 500))
     points = InitialPoints(see_through.model.means.detach(), torch.full((60, 3), 0.5), "dense")
     trainer = Trainer(bare, replace(plan, decisions=decisions), points)
     trainer.state.model.load_state_dict(see_through.model.state_dict())

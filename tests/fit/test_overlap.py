@@ -9,6 +9,7 @@ import torch
 from kgs.datasets import synthetic_scene
 from kgs.drop import DropGaussian
 from kgs.fit.config import DROP, FitConfig
+from kgs.fit.decisions import Decisions
 from kgs.fit.overlap import (
     FEW_TOGETHER,
     MANY_TOGETHER,
@@ -72,7 +73,7 @@ def test_what_is_open_is_decided_by_the_patches(scene, photos):
     assert plan.schedule.steps == chosen["steps"]
     numbers = {"views_per_patch": pytest.approx(photos), "views_per_pair": pytest.approx(together, abs=0.01)}
     found = {"overlap": {**numbers, "patches": 1000, **chosen}}
-    assert json.loads(json.dumps(plan.decisions)) == found
+    assert json.loads(json.dumps(plan.decisions.to_dict())) == found
     assert ("dropping" in left_out(plan.decisions)) == (chosen["drop"] == 0)
     assert (Trainer(scene, plan, points_seen_by(photos)).state.drop is None) == (chosen["drop"] == 0)
 
@@ -82,14 +83,14 @@ def test_what_is_open_is_decided_by_the_patches(scene, photos):
 )
 def test_without_patches_gaussians_are_dropped_in_a_fit_of_the_usual_length(scene, points):
     plan = decide_by_overlap(make_plan(scene, OPEN), points)
-    assert (plan.config.drop, plan.config.steps, plan.decisions) == (DROP, MANY.steps, {})
+    assert (plan.config.drop, plan.config.steps, plan.decisions) == (DROP, MANY.steps, Decisions())
 
 
 @pytest.mark.parametrize("given", [{"drop": 0.0}, {"drop": 0.2}, {"steps": 7}, {"steps": 7, "drop": 0.2}])
 def test_what_is_given_is_not_decided(scene, given):
     plan = decide_by_overlap(make_plan(scene, replace(OPEN, **given)), points_seen_by(8.0))
     assert {name: getattr(plan.config, name) for name in given} == given
-    assert not given.keys() & plan.decisions.get("overlap", {}).keys()
+    assert not given.keys() & plan.decisions.to_dict().get("overlap", {}).keys()
 
 
 def test_a_trainer_whose_plan_is_open_drops_in_a_fit_of_the_usual_length(scene, tmp_path):
@@ -115,7 +116,7 @@ def test_a_whole_fit_says_what_it_decided():
     """Eight photos of the room, all of which show most patches."""
     large = synthetic_scene("room", train_views=8, test_views=1, size=(96, 128))
     fit = fit_scene(large, FitConfig(steps=4, evaluations=1))
-    found = fit.history["decisions"]["overlap"]
-    assert 3 <= found["views_per_pair"] <= found["views_per_patch"] <= 8
-    assert found["drop"] == fit.settings.drop == pytest.approx(drop_rate_for(found["views_per_pair"]), abs=0.01)
-    assert "steps" not in found
+    found = fit.decisions.overlap
+    assert 3 <= found.views_per_pair <= found.views_per_patch <= 8
+    assert found.drop == fit.settings.drop == pytest.approx(drop_rate_for(found.views_per_pair), abs=0.01)
+    assert found.steps is None

@@ -11,15 +11,18 @@ from kornia.geometry.camera import PinholeCamera
 
 from kgs import GaussianModel
 from kgs.fit import Fit, FitConfig
+from kgs.fit.decisions import Decisions, DegreeDecision
 from kgs.fit.prune import QUANTUM, TOLERANCE, contributions, left_out, prune
 from kgs.reference import render
 from kgs.types import RasterOptions
+
+OTHERS = Decisions(sh_degree=DegreeDecision(0, "rule"))
 
 
 def as_fit(scene, model, **changes):
     """A fit whose Gaussians are these."""
     config = FitConfig(steps=5, sh_degree=model.max_sh_degree, **changes)
-    return Fit(scene, model, RasterOptions(near_plane=0.01), settings=config, history={"decisions": {"other": 1}})
+    return Fit(scene, model, RasterOptions(near_plane=0.01), settings=config, decisions=OTHERS)
 
 
 def in_front(scene, n, sh_degree=0):
@@ -53,9 +56,9 @@ def test_contributions_are_sums_of_blending_weights(each_backend, scene):
 def test_what_no_view_shows_is_left_out_and_the_pictures_stay(each_backend, scene):
     fit = as_fit(scene, in_front(scene, 40))
     pruned = prune(fit)
-    found = pruned.history["decisions"]["gaussians"]
-    assert found["fitted"] == 40 == len(fit.model)
-    assert found["kept"] == len(pruned.model) < 40
+    found = pruned.decisions.gaussians
+    assert found.fitted == 40 == len(fit.model)
+    assert found.kept == len(pruned.model) < 40
     assert not bool((pruned.model.means == fit.model.means[-1]).all(1).any())
     for i in range(3):
         view = scene.train.select([i])
@@ -67,8 +70,8 @@ def test_what_no_view_shows_is_left_out_and_the_pictures_stay(each_backend, scen
 def test_pruning_changes_no_other_fit_and_can_be_repeated_from_its_part(scene):
     fit = as_fit(scene, in_front(scene, 40))
     pruned = prune(fit)
-    assert (len(fit.model), fit.part, fit.history["decisions"]) == (40, {}, {"other": 1})
-    assert pruned.history["decisions"]["other"] == 1
+    assert (len(fit.model), fit.part, fit.decisions) == (40, {}, OTHERS)
+    assert pruned.decisions.sh_degree == OTHERS.sh_degree
     assert torch.equal(fit.model.select(**pruned.part).means, pruned.model.means)
 
 
@@ -85,7 +88,7 @@ def test_harmonics_that_no_picture_shows_are_left_out(scene, size, degree):
         model.sh_rest[:, 8:] = 0.0
     fit = as_fit(scene, model)
     pruned = prune(fit)
-    assert pruned.model.max_sh_degree == pruned.history["decisions"]["gaussians"]["sh_degree"] == degree
+    assert pruned.model.max_sh_degree == pruned.decisions.gaussians.sh_degree == degree
     camera = scene.train.camera(0)
     assert float((pruned.render(camera) - fit.render(camera)).abs().max()) <= QUANTUM + 0.02
 
@@ -122,11 +125,11 @@ def test_select_takes_rows_and_bands():
         (
             {
                 "sh_degree": {"chosen": 0, "by": "photos", "gain": 0.02, "n": 2000},
-                "gaussians": {"fitted": 200, "kept": 114},
+                "gaussians": {"fitted": 200, "kept": 114, "weight": 1.0, "sh_degree": 0},
             },
             "harmonics (they can gain +0.02 dB), 43 % of the Gaussians (next to no contribution to a training view)",
         ),
     ],
 )
 def test_what_was_left_out_in_words(found, words):
-    assert left_out(found) == words
+    assert left_out(Decisions.from_dict(found)) == words

@@ -180,7 +180,7 @@ def test_a_loop_of_ones_own(scene, points, done):
     with pytest.raises(ValueError, match="steps"):
         by_hand.train_step()
     other = Trainer(scene, plan, InitialPoints(points.points[:20], points.colors[:20], "random"))
-    with pytest.raises(ValueError, match="^gains: "):
+    with pytest.raises(ValueError, match="^decisions: "):
         other.load_state_dict(kept | {"decisions": {"exposure": {}}})
     assert (other.step, other.plan) == (0, plan)
     for trainer in (other, by_hand, Trainer(scene, plan, kept)):  # a fresh one, back in time, and from the state

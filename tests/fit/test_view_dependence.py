@@ -141,13 +141,13 @@ def test_surfaces_of_one_colour_need_no_harmonics(arc):
     images = arc.train.images * exposures + 0.02 * torch.randn(arc.train.images.shape, generator=generator())
     plan = decided(replace(arc, train=replace(arc.train, images=images.clamp(0, 1))))
     assert plan.config.sh_degree == 0
-    assert plan.decisions["sh_degree"]["by"] == "photos"
+    assert plan.decisions.sh_degree.by == "photos"
 
 
 def test_surfaces_with_harmonics_need_them(arc):
     plan = decided(with_harmonics(arc, "arc", 0.1))
     assert plan.config == with_step_defaults(replace(OPEN, sh_degree=3), 6)
-    assert plan.decisions["sh_degree"]["gain"] > MIN_GAIN
+    assert plan.decisions.sh_degree.gain > MIN_GAIN
 
 
 # -- what is decided ------------------------------------------------------------------------------------------------
@@ -165,7 +165,7 @@ def test_harmonics_have_to_gain_enough(monkeypatch, scene, gain, degree):
     assert plan.config.sh_degree == degree
     assert plan.schedule == make_plan(scene, plan.config).schedule
     found = {"chosen": degree, "by": "photos", "over": 3 - degree, "gain": pytest.approx(gain), "n": len(patches)}
-    assert json.loads(json.dumps(plan.decisions)) == {"sh_degree": found}
+    assert json.loads(json.dumps(plan.decisions.to_dict())) == {"sh_degree": found}
 
 
 @pytest.mark.parametrize(
@@ -177,9 +177,9 @@ def test_harmonics_have_to_gain_enough(monkeypatch, scene, gain, degree):
     ],
 )
 def test_where_colours_cannot_tell_there_are_no_harmonics(scene, points, why):
-    found = decide(make_plan(scene, OPEN), points).decisions["sh_degree"]
-    assert (found["chosen"], found["by"]) == (0, "rule")
-    assert why in found["why"]
+    found = decide(make_plan(scene, OPEN), points).decisions.sh_degree
+    assert (found.chosen, found.by) == (0, "rule")
+    assert why in found.why
 
 
 def test_what_is_given_is_not_decided(scene):

@@ -100,6 +100,7 @@ def fit(
     from kgs.datasets import load_scene
     from kgs.datasets.field import field_size
     from kgs.datasets.folders import CAMERAS_REPORT
+    from kgs.fit.decisions import Decisions
     from kgs.fit.prune import left_out
     from kgs.init_points.files import read_points
     from kgs.metrics.evaluate import as_text
@@ -169,7 +170,7 @@ def fit(
     shrink = request.shrink(base, loaded)
     shrunk = ("--downscale", f"{shrink:g}") if shrink > 1.0 else ()
     say(f"{printable(splat)}: {metrics['gaussians']} Gaussians after {metrics['steps']} steps")
-    if needless := left_out(metrics["decisions"]):
+    if needless := left_out(Decisions.from_dict(metrics["decisions"])):
         say(f"left out: {needless}")
     if published.signal:
         say_next("the same command with --resume goes on where it stopped")

@@ -21,6 +21,7 @@ from kgs.datasets.folders import CAMERAS_REPORT
 from kgs.datasets.load import load_scene
 from kgs.datasets.scene import Scene, Views
 from kgs.datasets.splits import select_evenly
+from kgs.fit.decisions import Decisions
 from kgs.fit.fit import Fit
 from kgs.fit.measures import used_init
 from kgs.fit.prune import contributions, left_out
@@ -110,7 +111,7 @@ def write_fit_page(
             remarks=[*_remarks(runs), *remarks],
             settings=_settings(settings or {}, fit.metrics),
             report=_report_facts(_read_report(report)),
-            left_out=left_out(first_run.get("decisions") or {}),
+            left_out=left_out(Decisions.from_dict(first_run.get("decisions") or {})),
         ),
     )
     return write_page(path, content)
