@@ -54,7 +54,7 @@ class Frame:
             raise wrong(f"expected intrinsics and a camera centre up to {LARGEST:g}")
         error = float((rotation.mT @ rotation - torch.eye(3, dtype=torch.float64)).abs().max())
         if not (error <= 1e-3 and float(torch.linalg.det(rotation)) > 0):  # the products may be NaN
-            raise wrong("expected a pose with a right-handed rotation, got another matrix")
+            raise wrong(f"expected a pose with a right-handed rotation, got {rotation.tolist()}")
 
 
 @dataclass(frozen=True, eq=False)

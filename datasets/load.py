@@ -108,8 +108,9 @@ def load_scene(
             if frame_set.model_points is None:
                 raise DataError(root, "points", "model-points are not available: there is no COLMAP model")
             cloud = frame_set.model_points(train)
-        if not bool((cloud.points.abs() <= LARGEST).all()):
-            raise DataError(root, "points", f"expected positions up to {LARGEST:g}, got others")
+        farthest = float(cloud.points.abs().max()) if len(cloud.points) else 0.0
+        if not farthest <= LARGEST:
+            raise DataError(root, "points", f"expected coordinates up to {LARGEST:g}, got {farthest:g}")
         if missing := [frame.path for frame in (*train, *test) if not frame.path.is_file()]:
             names = listed([path.relative_to(root) for path in missing], _LISTED)
             raise DataError(root, "", f"{len(missing)} of {len(train) + len(test)} images are missing: {names}")

@@ -246,7 +246,7 @@ class Densifier:
         """The gradients that the last backward pass stored in projected centres, `(M, 2)`."""
         if not means2d.requires_grad:
             why = "the means need requires_grad=True, and the render has to be made with gradients on"
-            raise ValueError(f"projected: expected means2d that need a gradient, got others: {why}")
+            raise ValueError(f"projected: expected means2d that require a gradient: {why}")
         name = "absgrad" if self.absgrad else "grad"
         gradient: Tensor | None = getattr(means2d, name, None)
         if gradient is None:

@@ -80,7 +80,9 @@ def save_ply(
     names = [*"xyz", "nx", "ny", "nz", *_properties_after_normals(3 * bands)]
     invalid = _invalid(table, names).any(axis=0)
     if invalid.any():
-        raise ValueError(f"model: expected values that are finite in float32, got others in {names[invalid.argmax()]}")
+        raise ValueError(
+            f"model: expected values that are finite in float32, got NaN or infinity in {names[invalid.argmax()]}"
+        )
     position = "float"
     if float32_moves(means, values["log_scales"]):
         position = "double"

@@ -98,7 +98,8 @@ def photometric_loss(
     if moments is not None and not isinstance(moments, TargetMoments):
         raise TypeError(f"moments: expected TargetMoments, got {type(moments).__name__}")
     if moments is not None and not _belong_to(moments, image):
-        raise ValueError(f"moments: expected those of a target like image, {tuple(image.shape)}, got others")
+        given = tuple(moments.padded.shape)
+        raise ValueError(f"moments: expected those of a target like image, {tuple(image.shape)}, got {given} padded")
     if isinstance(target, TargetMoments):
         target = target.padded[..., RADIUS:-RADIUS, RADIUS:-RADIUS].reshape(image.shape)
     _check_images(image, target)

@@ -173,8 +173,9 @@ def read_points(path: Path, image_ids: set[int]) -> tuple[NDArray[np.float64], N
     points = np.array([row[:3] for row in rows], np.float64).reshape(-1, 3)
     if not np.isfinite(points).all():
         raise DataError(path, "", "expected finite positions, got NaN or infinity")
-    if any(not 0 <= value <= 255 for row in rows for value in row[3:]):  # integers in a text file have no limit
-        raise DataError(path, "", "expected colours from 0 to 255, got others")
+    colors = [value for row in rows for value in row[3:]]
+    if not 0 <= min(colors, default=0) <= max(colors, default=0) <= 255:  # integers in a text file have no limit
+        raise DataError(path, "", f"expected colours from 0 to 255, got {min(colors)} to {max(colors)}"[:200])
     return points, np.array([row[3:] for row in rows], np.uint8).reshape(-1, 3)
 
 

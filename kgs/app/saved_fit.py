@@ -98,7 +98,7 @@ def _exposed(scene: Scene, path: Path, values: dict[str, Any]) -> Scene:
     try:
         return with_exposure(scene, Decisions.from_dict(values.get("decisions", {})))
     except (KeyError, TypeError, ValueError) as error:
-        raise DataError(path, "decisions", f"expected the gains of {len(scene.train)} photos, got others") from error
+        raise DataError(path, "decisions", f"expected the gains of {len(scene.train)} photos: {error}") from error
 
 
 def _posed(scene: Scene, path: Path, values: dict[str, Any]) -> Scene:
@@ -108,7 +108,8 @@ def _posed(scene: Scene, path: Path, values: dict[str, Any]) -> Scene:
         return scene
     extrinsics = poses.get("extrinsics") if isinstance(poses, dict) else None
     if not (isinstance(extrinsics, Tensor) and extrinsics.shape[1:] == (4, 4)):
-        raise DataError(path, "poses", "expected extrinsics (V, 4, 4), got others")
+        given = tuple(extrinsics.shape) if isinstance(extrinsics, Tensor) else type(poses).__name__
+        raise DataError(path, "poses", f"expected extrinsics (V, 4, 4), got {given}")
     if len(extrinsics) != len(scene.train):
         reason = f"has {len(scene.train)} training views, but the fit has poses of {len(extrinsics)}: fit again"
         raise DataError(scene.root, "train", reason)

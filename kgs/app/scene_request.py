@@ -13,7 +13,7 @@ from kgs.datasets.options import MASK_MODES
 from kgs.datasets.scene import Scene
 from kgs.fit.config import DETAILS
 
-_FINER = 1.1  # how many times as large photos must be to be worth a line
+_LARGER = 1.1  # how many times as large photos must be to be worth a line
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class SceneRequest:
         """The longer side in pixels with `--detail high`; None where the photos of the fit are about as large."""
         side = max(scene.train.images.shape[-2:])
         largest = min(DETAILS["high"].size, round(side * (self.downscale or 1.0)))
-        return largest if largest > _FINER * side else None
+        return largest if largest > _LARGER * side else None
 
     def shrink(self, base: Path, scene: Scene) -> float:
         """By what factor the photos of `scene` are smaller than the largest that its folder has."""

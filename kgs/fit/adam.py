@@ -86,6 +86,10 @@ class Adam:
             shapes = {"step": (), "exp_avg": parameter.shape, "exp_avg_sq": parameter.shape}
             negative = any(bool((loaded[name] < 0).any()) for name in ("step", "exp_avg_sq"))
             if negative or {name: tuple(value.shape) for name, value in loaded.items()} != shapes:
-                raise ValueError(f"optimizer: expected a step and two moments like {group['name']}, got others")
+                given = {name: tuple(value.shape) for name, value in loaded.items()}
+                raise ValueError(
+                    f"optimizer: expected a step and two moments of shape {tuple(parameter.shape)} for "
+                    f"{group['name']}, the second not negative, got shapes {given}"
+                )
             moments = {name: loaded[name].to(parameter, copy=True) for name in ("exp_avg", "exp_avg_sq")}
             self.state[parameter] = {"step": loaded["step"].to(parameter.device, torch.float32, copy=True), **moments}

@@ -97,7 +97,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         if metadata["format"] != _FORMAT:
             raise ValueError(f"expected the format {_FORMAT!r}, got {metadata['format']!r}")
         if metadata["sha256"] != _digest_all(metadata["state"], tensors):
-            raise ValueError("expected the checksum of the content, got another: the file is damaged")
+            raise ValueError("the checksum is not that of the content: the file is damaged")
         state = parse_json(metadata["state"].encode())
         for name, tensor in tensors.items():
             if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):

@@ -17,7 +17,7 @@ def parameter_fault(model: GaussianModel) -> str:
     for name, parameter in model.named_parameters():
         row = _first_row(~torch.isfinite(parameter.detach().exp() if name == "log_scales" else parameter.detach()))
         if row is not None:
-            return f"expected finite parameters, got others in {name} of Gaussian {row}"
+            return f"expected finite parameters, got {parameter[row].tolist()} in {name} of Gaussian {row}"
     return ""
 
 
@@ -36,7 +36,8 @@ def gradient_fault(model: GaussianModel) -> str:
         if not math.isfinite(float(torch.dot(flat, flat))):  # allocates no tensor of squares
             row = _first_row(~torch.isfinite(parameter.grad.square()))
             whose = "all Gaussians together" if row is None else f"Gaussian {row}"
-            return f"expected gradients below 1e19, got others in {name} of {whose}"
+            largest = float(parameter.grad.abs().max())
+            return f"expected gradients below 1e19, got up to {largest:g} in {name} of {whose}"
     return ""
 
 

@@ -41,7 +41,7 @@ def prune(fit: Fit) -> Fit:
         pruned = _part(fit, rows, model.sh_degree)
         if _is_as_good(pruned, levels):
             break
-    pruned = _with_fewest_harmonics(fit, pruned, levels)
+    pruned = _with_lowest_degree(fit, pruned, levels)
     kept = PruningDecision(len(model), len(pruned.model), limit, pruned.part["sh_degree"])
     return replace(pruned, decisions=replace(fit.decisions, gaussians=kept))
 
@@ -52,7 +52,7 @@ def _part(fit: Fit, rows: Tensor, sh_degree: int) -> Fit:
     return replace(fit, model=fit.model.select(rows, sh_degree), part=part)
 
 
-def _with_fewest_harmonics(fit: Fit, pruned: Fit, levels: list[float]) -> Fit:
+def _with_lowest_degree(fit: Fit, pruned: Fit, levels: list[float]) -> Fit:
     """The pruned fit with the lowest degree that changes no image."""
     views = fit.scene.train
     rows = pruned.part["rows"].to(fit.device)

@@ -170,7 +170,10 @@ class TrainState:
         with state_errors():
             model = GaussianModel(**copy.deepcopy(values["model"]))
             if model.max_sh_degree != (plan.config.sh_degree or 0) or model.means.dtype != torch.float32:
-                raise ValueError(f"model: expected float32 and harmonics of degree {plan.config.sh_degree}, got others")
+                given = f"{model.means.dtype} and degree {model.max_sh_degree}"
+                raise ValueError(
+                    f"model: expected float32 and harmonics of degree {plan.config.sh_degree}, got {given}"
+                )
             start = Start(*(copy.deepcopy(values[name]) for name in ("init", "extent", "near_plane", "depth")))
         state = cls._assemble(scene, plan, model, start)
         with state_errors():
@@ -258,10 +261,12 @@ def check_saved(saved: dict[str, Any], scene: dict[str, Any], config: FitConfig,
             if before != sums:
                 both = zip(scene[part]["names"], before or [], sums or [], strict=False)
                 changed = ", ".join(name for name, one, other in both if one != other)
-                fault = f"{what} of the {part} views: expected those that the fit was begun with, got others"
-                raise ValueError(f"{fault} for {changed:.200}" if changed else fault)
+                given = (
+                    f"changed ones: {changed:.200}" if changed else f"{len(sums or [])} instead of {len(before or [])}"
+                )
+                raise ValueError(f"{what} of the {part} views: expected those that the fit was begun with, got {given}")
     if saved["scene"]["background"] != scene["background"]:
-        raise ValueError("background: expected the one that the fit was begun with, got another")
+        raise ValueError("background: expected the colour that the fit was begun with; this scene has a changed one")
     if max(saved["stack"], default=0) >= len(scene["training"]["names"]):
         raise ValueError(f"stack: expected views of the scene, got {saved['stack']!s:.80}")
     return notes

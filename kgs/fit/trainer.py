@@ -280,7 +280,7 @@ class Trainer:
             if decay is None:  # more steps may have another
                 decay = saved["recipe"]["opacity_decay"]
         except (KeyError, TypeError) as error:
-            raise DataError(path, "config", "expected the configuration of a fit, got another") from error
+            raise DataError(path, "config", f"expected the configuration of a fit, got one without {error}") from error
         with _errors_of(path):
             config = replace(config, **decided, recipe=replace(config.recipe, opacity_decay=decay))
         plan = make_plan(scene, config)

@@ -163,7 +163,7 @@ def measure_again(
         try:
             old_rows = {row["name"]: row for row in old["views"]}
         except (KeyError, TypeError) as error:
-            raise DataError(path, part, "expected the metrics of a fit, got something else") from error
+            raise DataError(path, part, f"expected the metrics of a fit, got {str(old)[:60]}") from error
         if set(old_rows) != set(views.names):
             raise DataError(path, part, f"has other views than the {len(views)} of {scene.root}: fit again")
         new = evaluate(render, views, lpips, correct_color=part == "color_corrected") if old_rows else None

@@ -217,13 +217,13 @@ def test_eval_adds_lpips_to_measures_and_page(done: Path, monkeypatch: Any, caps
     assert is_own(done, "metrics.json")
 
 
-def flat_views(masks: Any = None, border_mask: Any = None) -> Views:
+def flat_views(alphas: Any = None, border_mask: Any = None) -> Views:
     """Two photos of 20 x 30 pixels: grey inside, of two colours at the border."""
     images = torch.full((2, 3, 20, 30), 0.5)
     for image, colour in zip(images, ([0.2, 0.4, 0.6], [0.4, 0.4, 0.8]), strict=True):
         image[:, [0, -1], :] = torch.tensor(colour)[:, None, None]
         image[:, :, [0, -1]] = torch.tensor(colour)[:, None, None]
-    return replace(random_views(2, 20, 30), images=images, alphas=masks, border_mask=border_mask)
+    return replace(random_views(2, 20, 30), images=images, alphas=alphas, border_mask=border_mask)
 
 
 def test_the_ground_is_the_mean_of_the_photos_border() -> None:

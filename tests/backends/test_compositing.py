@@ -128,7 +128,7 @@ def test_exact_sum_is_the_reference(seed, dtype, image_bound, bound, sh_degree):
 
 
 # two clamped layers leave (1 - 0.99)^2 of the light, which is the stop: opacities above 1 are often in doubt
-@pytest.mark.parametrize(("opacities", "most"), [((0.05, 0.95), 1e-3), ((0.6, 1.3), 1e-2)])
+@pytest.mark.parametrize(("opacities", "maximum"), [((0.05, 0.95), 1e-3), ((0.6, 1.3), 1e-2)])
 @pytest.mark.parametrize(
     ("dtype", "image_bound", "bound"), [(torch.float32, 5e-6, 1e-5), (torch.float64, 1e-10, 1e-10)]
 )

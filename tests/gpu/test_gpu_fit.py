@@ -91,7 +91,7 @@ def test_a_fit_that_looks_seldom_finds_what_is_not_finite_and_never_saves_it(sce
     fit.save(tmp_path / "checkpoint.safetensors")
     with torch.no_grad():
         fit.model.means[3] = torch.nan
-    with pytest.raises(kgs.TrainingDiverged, match="expected finite parameters, got others in means of Gaussian 3"):
+    with pytest.raises(kgs.TrainingDiverged, match="expected finite parameters, got .* in means of Gaussian 3"):
         fit.save(tmp_path / "checkpoint.safetensors")
     with pytest.raises(kgs.TrainingDiverged, match=r"step 20: expected finite parameters"):
         fit.fit()

@@ -63,7 +63,7 @@ def save_glb(
     attributes = _attributes(model)
     for name, values in attributes.items():
         if not np.isfinite(values).all():
-            raise ValueError(f"model: expected values that are finite in float32, got others in {name}")
+            raise ValueError(f"model: expected values that are finite in float32, got NaN or infinity in {name}")
     matrix = rotation.double().cpu()
     quaternion = rotation_matrix_to_quaternion(matrix)[[1, 2, 3, 0]]  # from w, x, y, z to x, y, z, w
     translation = torch.zeros(3, dtype=torch.float64, device="cpu")

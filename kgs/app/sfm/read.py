@@ -207,11 +207,11 @@ def read_photos(opened: list[OpenPhoto], bar: ProgressBar) -> list[Photo]:
     Raises:
         DataError: a photo cannot be decoded.
     """
-    most_lie = 2 * sum(photo.size[0] > photo.size[1] for photo in opened) >= len(opened)
+    lying_is_usual = 2 * sum(photo.size[0] > photo.size[1] for photo in opened) >= len(opened)
     usual = max(by_shape(opened).values(), key=len)[0].size
-    lies = {photo.name: _lies(photo.size, most_lie) for photo in opened}
+    lies = {photo.name: _lies(photo.size, lying_is_usual) for photo in opened}
     parts = {photo.name: _middle(photo.size, usual, lies[photo.name]) for photo in opened}
-    width, height = min(sorted(part, reverse=most_lie) for part in parts.values())
+    width, height = min(sorted(part, reverse=lying_is_usual) for part in parts.values())
     scale = min(1.0, LONGEST / max(width, height))
     size = max(1, round(width * scale)), max(1, round(height * scale))
     lenses = _lens_numbers(opened)
@@ -219,7 +219,7 @@ def read_photos(opened: list[OpenPhoto], bar: ProgressBar) -> list[Photo]:
     for photo in bar(opened, "photos", "photo"):
         pixels = np.ascontiguousarray(turn(photo.image.read(), photo.exif.orientation))
         kept = _kept(photo)
-        is_turned = lies[photo.name] != most_lie and width != height
+        is_turned = lies[photo.name] != lying_is_usual and width != height
         part = size[::-1] if is_turned else size
         whole = _larger(part, photo.size, parts[photo.name])
         upright = _reduced(pixels, whole, kept)
@@ -240,10 +240,10 @@ def read_photos(opened: list[OpenPhoto], bar: ProgressBar) -> list[Photo]:
     return photos
 
 
-def _lies(size: tuple[int, int], most_lie: bool) -> bool:
+def _lies(size: tuple[int, int], lying_is_usual: bool) -> bool:
     """Whether an image is wider than high; a square one counts as most do."""
     width, height = size
-    return width > height or (width == height and most_lie)
+    return width > height or (width == height and lying_is_usual)
 
 
 def _middle(size: tuple[int, int], shape: tuple[int, int], lies: bool) -> tuple[int, int]:
