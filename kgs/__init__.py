@@ -1,4 +1,10 @@
-"""Differentiable 3D Gaussian splatting for sparse views, in PyTorch and Kornia, with DropGaussian as a layer."""
+"""Differentiable 3D Gaussian splatting for sparse views, in PyTorch and Kornia, with DropGaussian as a layer.
+
+The method: `drop` (the layer), `renderer`, `model`, `types`, `camera`, `projection`, `covariance`, `harmonics`,
+`geometry`, `stages` (project, composite), `reference` (the dense renderer), `densify`, `ply`, `compressed_ply`.
+`backends` run the stages; `losses`, `datasets`, `init_points`, `fit` and `metrics` go from photos to a measured splat;
+`gsplat` has gsplat's interface; `app` is the command.
+"""
 
 import os
 import sys
