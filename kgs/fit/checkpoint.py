@@ -24,7 +24,7 @@ from kgs._support.json_files import parse_json
 
 from .state import digest
 
-_FORMAT = "kgs checkpoint 5"
+_FORMAT = "kgs checkpoint 6"
 
 
 def previous(path: Path) -> Path:
@@ -127,7 +127,10 @@ def _take_tensors(value: Any, tensors: dict[str, Tensor], path: str = "") -> Any
         if not isinstance(key, str) or "/" in key:
             raise TypeError(f"state: expected text without '/' as keys, got {key!r}")
         if isinstance(item, Tensor):
-            tensors[path + key] = item.detach().to("cpu", copy=True).contiguous()  # safetensors refuses shared memory
+            tensor = item.detach().cpu().contiguous()
+            others = {other.untyped_storage().data_ptr() for other in tensors.values()}
+            is_shared = tensor.untyped_storage().data_ptr() in others  # which safetensors refuses
+            tensors[path + key] = tensor.clone() if is_shared else tensor
         else:
             rest[key] = _take_tensors(item, tensors, f"{path}{key}/")
     return rest

@@ -58,13 +58,10 @@ class MovingPoses:
         return PinholeCamera(camera.intrinsics, pose, camera.height, camera.width)
 
     @torch.no_grad()
-    def step(self, scene: Scene, progress: float) -> Scene:
-        """Move the last result of :meth:`camera`, if its gradient is finite; `progress` of the fit is in (0, 1].
-
-        Returns the scene with its training cameras at their current poses.
-        """
+    def step(self, progress: float) -> None:
+        """Move the last result of :meth:`camera`, if its gradient is finite; `progress` of the fit is in (0, 1]."""
         if self._seen is None or (found := self._seen[1].grad) is None or not bool(found.isfinite().all()):
-            return scene
+            return
         view = self._seen[0]
         motion = self._motions[view]
         pose = self.extrinsics[view]
@@ -81,7 +78,6 @@ class MovingPoses:
         motion.grad = None
         motion.zero_()
         self._fix_gauge()
-        return with_extrinsics(scene, self.extrinsics)
 
     def moved(self) -> dict[str, float]:
         """How far the cameras moved: mean and maximum, rotations in degrees, shifts as shares of the median depth."""

@@ -143,7 +143,7 @@ class TrainState:
             self.notes.append(text)
 
     def to_dict(self) -> dict[str, Any]:
-        """The state as nested dicts of tensors and plain values, copied."""
+        """The state as nested dicts of tensors and plain values, which are not copied."""
         parts = {
             "model": self.model.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -158,7 +158,7 @@ class TrainState:
             "depth": self.start.depth,
         }
         plain = {name: getattr(self, name) for name in ("step", "seconds", "stack", "curve", "notes")}
-        return copy.deepcopy(parts | plain)
+        return parts | plain
 
     @classmethod
     def from_dict(cls, scene: Scene, plan: Plan, values: dict[str, Any]) -> Self:

@@ -4,6 +4,7 @@ Views, splits, drop masks and backgrounds have random streams of their own, so t
 the same views in the same order.
 """
 
+import copy
 import math
 import os
 import time
@@ -66,7 +67,6 @@ class Trainer:
         ValueError: images are too small, points too few, or the state is of another fit.
 
     Attributes:
-        scene: with the current poses of the training cameras, if the fit refines them.
         plan: as given.
         state: everything that changes, a `kgs.fit.state.TrainState`.
         renderer: with the drop layer inside; in `eval()` mode it renders all Gaussians.
@@ -78,7 +78,6 @@ class Trainer:
         check_kind("scene", scene, Scene)
         check_kind("plan", plan, Plan)
         self._input_scene = scene
-        self.scene = scene
         self.plan = plan
         self.saved = ""
         self.is_saved = False
@@ -105,11 +104,17 @@ class Trainer:
             absgrad=config.recipe.absgrad,
             backend=self.plan.backend,
         ).train()
-        self.scene = scene if state.poses is None else with_extrinsics(scene, state.poses.extrinsics)
+        self._exposed_scene = scene
         self._views = targets(scene.train, scene.background, self.plan.device)
         self._half_size = (
             targets(scene.train.downsample(2), scene.background, self.plan.device) if self.plan.schedule.coarse else []
         )
+
+    @property
+    def scene(self) -> Scene:
+        """The scene, with the current poses of the training cameras where the fit refines them."""
+        poses = self.state.poses
+        return self._exposed_scene if poses is None else with_extrinsics(self._exposed_scene, poses.extrinsics)
 
     @property
     def model(self) -> GaussianModel:
@@ -210,6 +215,9 @@ class Trainer:
 
     def state_dict(self) -> dict[str, Any]:
         """The state, and what it belongs to: nested dicts of tensors and plain values, copied."""
+        return copy.deepcopy(self._state_dict())
+
+    def _state_dict(self) -> dict[str, Any]:
         return self.state.to_dict() | {
             "config": self.plan.config.to_dict(),
             "backend": self.plan.backend,
@@ -253,7 +261,7 @@ class Trainer:
         if self._look_every > 1:
             self._stop_if(parameter_fault(self.model))
         self.is_saved = False
-        save_checkpoint(Path(path), self.state_dict() | {"shown": part or {}})
+        save_checkpoint(Path(path), self._state_dict() | {"shown": part or {}})
         self.saved = f"{path} of step {self.step}"
         self.is_saved = True
 
@@ -353,12 +361,12 @@ class Trainer:
         if decay is not None and decay < 1.0 and progress > recipe.decay_from:
             state.densifier.decay_opacity(decay)
         if state.poses is not None:
-            self.scene = state.poses.step(self.scene, progress)
+            state.poses.step(progress)
 
     def _measure_curve(self) -> None:
         state = self.state
         fit = self.result()
-        levels = {"test_psnr": fit.psnr(self.scene.test), "train_psnr": fit.psnr(self.scene.train)}
+        levels = {"test_psnr": fit.psnr(fit.scene.test), "train_psnr": fit.psnr(fit.scene.train)}
         state.curve.append({"step": state.step, "seconds": round(state.seconds, 3), **levels})
 
     def _densify(self) -> None:
