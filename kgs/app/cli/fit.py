@@ -4,7 +4,7 @@ import inspect
 import os
 import re
 import warnings
-from dataclasses import field, make_dataclass, replace
+from dataclasses import MISSING, field, make_dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_type_hints
@@ -16,7 +16,7 @@ from kgs.app.console import VIEWER, as_line, say, say_next
 from kgs.fit.config import COARSE, DETAILS, PRESETS, Background, FitConfig, min_side
 
 from .checks import SMALLEST, check_photos, check_roll, check_scene
-from .options import IfGiven, On, Out, options_in
+from .options import QUIET, IfGiven, On, Out, options_in
 from .tools import check_installed, load_tools
 from .unposed import find_scene, is_unposed, on_ctrl_c
 
@@ -222,13 +222,15 @@ def short_help(config: FitConfig) -> type[Any]:
     hints = get_type_hints(fit, include_extras=True)
     for name, parameter in inspect.signature(fit).parameters.items():
         is_named = parameter.kind is parameter.KEYWORD_ONLY
-        default = {} if parameter.default is parameter.empty else {"default": parameter.default}
+        hint = hints[name] if is_named else Annotated[hints[name], tyro.conf.Positional]
+        default = MISSING if parameter.default is parameter.empty else parameter.default
         if name not in _RARE:
-            entries.append((name, hints[name] if is_named else tyro.conf.Positional[hints[name]], field(**default)))
+            entries.append((name, hint, field(default=default)))
     hints = get_type_hints(FitConfig, include_extras=True)
     for name in _OF_CONFIG:
         value = getattr(config, name)
-        entries.append((name, IfGiven[hints[name]] if value is None else hints[name], field(default=value)))
+        hint = Annotated[hints[name], QUIET] if value is None else hints[name]
+        entries.append((name, hint, field(default=value)))
     kind: type[Any] = make_dataclass("ShortHelp", entries, kw_only=True)
     of_config = inspect.cleandoc(FitConfig.__doc__ or "").partition("Args:")[2]
     kind.__doc__ = inspect.cleandoc(fit.__doc__ or "") + of_config

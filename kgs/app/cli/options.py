@@ -10,9 +10,9 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 from kgs._support.errors import DataError
 
 Value = TypeVar("Value")
-# The help leaves out "(default: None)", and "(default: True)" of a flag `--no-...`.
-IfGiven = Annotated[Value | None, tyro.conf.arg(help_behavior_hint="")]
-On = Annotated[bool, tyro.conf.arg(help_behavior_hint="")]
+QUIET = tyro.conf.arg(help_behavior_hint="")  # the help leaves out "(default: None)", or True of a flag `--no-...`
+IfGiven = Annotated[Value | None, QUIET]
+On = Annotated[bool, QUIET]
 
 EMPTY = Path()  # what "" on a command line becomes: this object. An equal one is the current folder.
 
