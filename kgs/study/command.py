@@ -9,23 +9,25 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from kgs._support.errors import DataError
-from kgs.app.cli.options import Existing, Out
+from kgs.app.cli.options import IfGiven, Out
+from kgs.app.cli.tools import check_installed, load_tools
+from kgs.fit.config import FitConfig
 
 
 def study(
     *,
     out: Out,
     preset: Literal["quick", "cpu", "field", "field-long", "paper", "beyond", "guard"] = "quick",
-    processes: int | None = None,
-    scheduler: str | None = None,
-    lpips_weights: Existing | None = None,
+    processes: IfGiven[int] = None,
+    scheduler: IfGiven[str] = None,
+    lpips_weights: IfGiven[Path] = None,
     report_only: bool = False,
-    scenes: tuple[str, ...] | None = None,
-    methods: tuple[str, ...] | None = None,
-    views: tuple[int, ...] | None = None,
-    seeds: tuple[int, ...] | None = None,
-    table: int | None = None,
-    steps: int | None = None,
+    scenes: IfGiven[tuple[str, ...]] = None,
+    methods: IfGiven[tuple[str, ...]] = None,
+    views: IfGiven[tuple[int, ...]] = None,
+    seeds: IfGiven[tuple[int, ...]] = None,
+    table: IfGiven[int] = None,
+    steps: IfGiven[int] = None,
     list_cells: Annotated[bool, tyro.conf.arg(name="list")] = False,
 ) -> int:
     """Compare fits with and without DropGaussian, its schedules and rivals, over scenes and seeds.
@@ -69,7 +71,18 @@ def study(
             be overwritten.
         ValueError: the preset has no such fits, `table` is not of this preset, or `steps` is out of its range.
     """
+    from kgs.app.files.outputs import check_folder
     from kgs.app.files.publishing import replacing
+    from kgs.metrics.weights import weight_files
+
+    check_folder(out, make=False)
+    if table is not None and preset != "paper":
+        raise ValueError(f"table: expected the preset 'paper', which has the tables, got {preset!r}")
+    FitConfig(steps=steps)
+    if lpips_weights is not None:
+        weight_files(lpips_weights)
+    check_installed("pandas", "scipy", "distributed", "matplotlib", "jinja2")
+    load_tools()
 
     from . import beyond, beyond_report, guard, paper_tables, presets
     from .cells import sparse_cell
@@ -133,21 +146,3 @@ def _list(cells: list[dict[str, Any]], rows: list[dict[str, Any]]) -> None:
         state = "done" if cell in done else "to do"
         print(f"{state:>5}: {name_of(cell)}")
     print(f"{len(done)} of {len(cells)} are done")
-
-
-def check_study(
-    out: Path, preset: str, table: int | None, steps: int | None, lpips_weights: Path | None, **_: Any
-) -> None:
-    """Check the arguments of `kgs study`."""
-    from kgs.app.cli.checks import check_installed
-    from kgs.app.files.outputs import check_folder
-    from kgs.fit.config import FitConfig
-    from kgs.metrics.weights import weight_files
-
-    check_installed("cpu", "auto", "pandas", "scipy", "distributed", "matplotlib", "jinja2")
-    check_folder(out, make=False)
-    if table is not None and preset != "paper":
-        raise ValueError(f"table: expected the preset 'paper', which has the tables, got {preset!r}")
-    FitConfig(steps=steps)
-    if lpips_weights is not None:
-        weight_files(lpips_weights)

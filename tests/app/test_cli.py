@@ -17,9 +17,9 @@ from command import one_line, run
 from tiny_scenes import write_colmap
 
 import kgs
-import kgs.app.cli.run
-from kgs.app import cli
-from kgs.app.cli.fit import defaults
+from kgs.app.cli.fit import first_config
+from kgs.app.cli.run import COMMANDS, load_command
+from kgs.app.cli.tools import explain_import_error, load_package, load_tools
 from kgs.app.files.outputs import EXPORTS, FILMS
 from kgs.app.files.results_folder import CHECKPOINT, PREVIOUS
 from kgs.fit.config import DETAILS, DROP, PAPER, PRESETS, FitConfig
@@ -99,6 +99,11 @@ def test_eval_measures_the_same_and_keeps_the_rest(fitted, capsys):
     assert "PSNR" in capsys.readouterr().out
 
 
+def test_eval_refuses_a_device_that_is_not_there(fitted, capsys):
+    assert run("eval", fitted, "--device", "foo") == 2
+    assert "--device: expected" in one_line(capsys)
+
+
 def test_eval_refuses_measures_of_other_views(fitted, capsys, tmp_path):
     shutil.copytree(fitted, tmp_path / "copy")
     path = tmp_path / "copy" / "metrics.json"
@@ -143,10 +148,10 @@ def small(tmp_path_factory):
         ("fit {scene} -o {out} --downscale 2", "--downscale: expected at least 32 pixels, got photos"),
         ("fit {scene} --views 3", "-o: expected a folder for the results, for example kgs fit {scene} --views 3 -o "),
         ("fit {small} -o {out}", "{small}: images: expected at least 32 pixels"),
+        ("fit {scene} -o {out} --device gpu", "--device: expected"),
         ("demo -o {out} --device foo", "--device: expected"),
         ("demo -o {scene}", "holds files of a scene"),
         ("eval {scene} --lpips-weights {missing}", "missing"),
-        ("eval {scene} --device foo", "--device: expected"),
         ("render {file} --cameras {scene} -o {out} --downscale 0.5", "--downscale: expected"),
         ("render {file} --cameras {scene} -o {scene}/train", "holds files of a scene"),
         ("render {file} --cameras {scene} -o {out} --device foo", "--device: expected"),
@@ -256,7 +261,7 @@ def test_presets_and_details_are_starts_that_options_change(folder, tmp_path, mo
     ],
 )
 def test_the_preset_is_the_one_that_is_given_last(words, preset):
-    assert defaults(words.split())["config"] == PRESETS[preset]
+    assert first_config(words.split()) == PRESETS[preset]
 
 
 def test_words_after_two_dashes_are_no_options(folder, tmp_path, capsys, monkeypatch):
@@ -278,7 +283,7 @@ def test_versions(capsys, monkeypatch):
     assert "numba is not installed" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("command", cli.run._COMMANDS)
+@pytest.mark.parametrize("command", COMMANDS)
 def test_each_help_page_says_what_options_do_and_has_two_examples_that_parse(command, capsys):
     words = command.split()
     assert run(*words, "--help") == 0
@@ -289,11 +294,11 @@ def test_each_help_page_says_what_options_do_and_has_two_examples_that_parse(com
     assert f"usage: kgs {command} " in said
     examples = re.findall(rf"^  (?:[A-Z_]+=\S+ )*kgs {command}(|  *.+)$", said, re.M)
     assert len(examples) == 2
-    function, defaults = cli.run._load(command)
-    parse = functools.wraps(function)(lambda *_, **__: None)
+    parse = functools.wraps(load_command(command))(lambda *_, **__: None)
     for example in examples:
         options = shlex.split(example)
-        tyro.cli(functools.partial(parse, **defaults(options)), args=options)
+        config = {"config": first_config(options)} if command == "fit" else {}
+        tyro.cli(functools.partial(parse, **config), args=options)
 
 
 def test_the_help_of_a_fit_is_short_and_its_last_line_names_the_long_one(folder, tmp_path, capsys, monkeypatch):
@@ -373,15 +378,18 @@ def test_a_package_that_cannot_be_loaded_is_one_line(tmp_path, package, project,
 
 def test_a_large_package_that_cannot_be_loaded(monkeypatch):
     def broken(name):
-        raise OSError("libcudart.so.12: cannot open shared object file")  # torch loads its libraries itself
+        if name in bad:
+            raise OSError("libcudart.so.12: cannot open shared object file")  # torch loads its libraries itself
 
-    monkeypatch.setattr(cli.run, "import_module", broken)
+    bad = ["torch"]
+    monkeypatch.setattr("kgs.app.cli.tools.import_module", broken)
     with pytest.raises(ImportError, match="libcudart") as caught:
-        cli.run._import("torch")
-    assert "torch is installed, but cannot be loaded (libcudart" in cli.run._of_a_broken_package(caught.value)
-    cli.run._import("numba")  # torch may do in its place
+        load_package("torch")
+    assert "torch is installed, but cannot be loaded (libcudart" in explain_import_error(caught.value)
+    bad = ["numba"]
+    assert load_tools().type == "cpu"  # torch may do in its place
     with pytest.raises(ImportError, match="of ours"):
-        cli.run._of_a_broken_package(ImportError("of ours", name="kgs._support.errors"))
+        explain_import_error(ImportError("of ours", name="kgs._support.errors"))
 
 
 @pytest.mark.slow

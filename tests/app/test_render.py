@@ -12,7 +12,7 @@ from factories import random_model
 import kgs
 from kgs import GaussianRenderer, save_ply
 from kgs._support.errors import DataError
-from kgs.app.cli.page import check_page, page
+from kgs.app.cli.page import page
 from kgs.app.cli.render import render
 from kgs.app.page import pictures
 from kgs.datasets import load_scene, synthetic_scene
@@ -128,9 +128,9 @@ def test_a_splat_that_no_camera_sees_is_refused_before_anything_is_written(splat
 
 def test_a_splat_without_gaussians_is_refused(splat, llff, tmp_path):
     save_ply(tmp_path / "empty.ply", kgs.ply.load_ply(splat).select(torch.arange(0)))
-    for command in (render, page):
+    for command, out in ((render, "renders"), (page, "page.html")):
         with pytest.raises(DataError, match=r"empty\.ply: Gaussians: expected at least one, got none$"):
-            command(tmp_path / "empty.ply", cameras=llff, out=tmp_path / "out")
+            command(tmp_path / "empty.ply", cameras=llff, out=tmp_path / out)
 
 
 def test_cameras_that_see_nothing_are_named(splat, llff, tmp_path, capsys):
@@ -162,4 +162,4 @@ def test_a_page_of_any_splat(splat, llff, tmp_path, capsys, monkeypatch):
     page(splat, cameras=llff, out=out)
     assert (tmp_path / "kept" / "page.html").read_text() == "mine"
     with pytest.raises(DataError, match="expected a file in a folder that is there"):
-        check_page(llff, tmp_path / "no" / "page.html", None, 0.0, "cpu", "auto")
+        page(splat, cameras=llff, out=tmp_path / "no" / "page.html")

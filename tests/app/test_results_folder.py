@@ -19,8 +19,8 @@ import torch
 
 from kgs._support.errors import DataError, TrainingDiverged
 from kgs.app import fit_folder as app
-from kgs.app.cli.demo import check_demo
-from kgs.app.cli.evaluate import check_evaluate, evaluate
+from kgs.app.cli.demo import demo
+from kgs.app.cli.evaluate import evaluate
 from kgs.app.files import publishing
 from kgs.app.files.locks import locked
 from kgs.app.files.publishing import begin, enter, is_own, unpublished
@@ -297,7 +297,7 @@ def test_eval_does_not_write_over_a_fit_that_came_meanwhile(scene: Any, done: Pa
 def test_eval_says_how_to_go_on_with_a_fit_that_was_killed(tmp_path: Path) -> None:
     begin(tmp_path, "fit")
     with pytest.raises(DataError, match="kgs fit --resume"):
-        check_evaluate(tmp_path, None, "cpu", "auto")
+        evaluate(tmp_path)
 
 
 def test_an_eval_that_fails_while_it_writes_changes_nothing(scene: Any, done: Path, monkeypatch: Any) -> None:
@@ -320,7 +320,7 @@ def test_what_another_fit_is_kept_until_is_said(scene: Any, done: Path) -> None:
 
 def test_a_demo_does_not_mix_with_a_fit(done: Path) -> None:
     with pytest.raises(DataError, match="holds the results of kgs fit"):
-        check_demo(done, size=(24, 32), steps=3, device="cpu", backend="auto")
+        demo(out=done, size=(24, 32), steps=3)
 
 
 def test_a_file_that_the_user_writes_or_changes_during_a_fit_is_kept(scene: Any, done: Path, monkeypatch: Any) -> None:

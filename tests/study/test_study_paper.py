@@ -6,7 +6,7 @@ import pytest
 
 from kgs import DataError
 from kgs.study import presets
-from kgs.study.command import check_study, study
+from kgs.study.command import study
 from kgs.study.paper_tables import TABLES, cells_of_table
 from kgs.study.published import PUBLISHED, published
 
@@ -73,4 +73,4 @@ def test_a_table_that_is_not_there(data, table):
 
 def test_a_table_of_another_preset_is_refused_before_any_work(tmp_path):
     with pytest.raises(ValueError, match=r"^table: .*'paper'.*'quick'"):
-        check_study(tmp_path, preset="quick", table=1, steps=None, lpips_weights=None)
+        study(out=tmp_path, table=1)

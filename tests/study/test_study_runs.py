@@ -12,7 +12,7 @@ from kgs import DataError
 from kgs.datasets import load_scene
 from kgs.study import grid, presets
 from kgs.study.beyond import beyond_cells
-from kgs.study.command import check_study, study
+from kgs.study.command import study
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def test_other_steps_make_other_cells_that_differ_in_nothing_else(preset):
 
 @pytest.mark.parametrize("steps", [0, -1])
 def test_steps_are_checked_as_those_of_a_fit(steps, tmp_path):
-    for call in (presets.with_steps, lambda _, steps: check_study(tmp_path, "quick", None, steps, None)):
+    for call in (presets.with_steps, lambda _, steps: study(out=tmp_path, steps=steps)):
         with pytest.raises(ValueError, match=f"^steps: .*{steps}"):
             call([tiny_cell()], steps)
 

@@ -1,9 +1,9 @@
 """`kgs bench`: what rendering costs on this machine, and how exact it is."""
 
 from pathlib import Path
-from typing import Any
 
 from .options import Out
+from .tools import check_installed, load_tools
 
 
 def speed(*, out: Out, quick: bool = False, device: str = "cpu") -> None:
@@ -20,6 +20,9 @@ def speed(*, out: Out, quick: bool = False, device: str = "cpu") -> None:
         quick: fewer Gaussians and repetitions.
         device: where to render: cpu, cuda, cuda:1, ...
     """
+    check_installed("matplotlib")
+    _begin(out, device)
+
     from kgs.app.files.publishing import replacing
     from kgs.bench.speed import speed
 
@@ -40,6 +43,9 @@ def precision(*, out: Out, quick: bool = False) -> None:
         out: folder for the results, created if it does not exist.
         quick: small images with few Gaussians.
     """
+    check_installed("matplotlib")
+    _begin(out)
+
     from kgs.app.files.publishing import replacing
     from kgs.bench.precision import precision
 
@@ -59,6 +65,8 @@ def extremes(*, out: Out) -> int:
     Args:
         out: folder for the results, created if it does not exist.
     """
+    _begin(out)
+
     from kgs.app.files.publishing import replacing
     from kgs.bench.extremes import extremes
 
@@ -66,23 +74,9 @@ def extremes(*, out: Out) -> int:
         return extremes(out=new)
 
 
-def check_speed(out: Path, device: str, **_: Any) -> None:
-    """Check the arguments of `kgs bench speed`."""
-    from kgs.app.files.outputs import check_folder
-
-    from .checks import check_installed
-
-    check_installed(device, "auto", "matplotlib")
-    check_folder(out, make=False)
-
-
-def check_precision(out: Path, **_: Any) -> None:
-    """Check the arguments of `kgs bench precision`."""
-    check_speed(out, "cpu")
-
-
-def check_extremes(out: Path, **_: Any) -> None:
-    """Check the arguments of `kgs bench extremes`."""
+def _begin(out: Path, device: str = "cpu") -> None:
+    """Check the folder for the results, and load torch."""
     from kgs.app.files.outputs import check_folder
 
     check_folder(out, make=False)
+    load_tools(device)

@@ -1,7 +1,10 @@
 """`kgs check`: what is installed, and whether it works."""
 
+from .options import IfGiven
+from .tools import load_tools
 
-def check(*, device: str | None = None) -> int:
+
+def check(*, device: IfGiven[str] = None) -> int:
     """Check this installation: versions, devices, and whether each backend is right and how fast it is.
 
     For example:
@@ -14,6 +17,8 @@ def check(*, device: str | None = None) -> int:
     Args:
         device: what to check: cpu, cuda, cuda:1, xpu, ... Unless given: the CPU and all GPUs.
     """
+    load_tools()
+
     from kgs.bench.check import check
 
     return check(device=device)

@@ -1,13 +1,5 @@
-"""Checks of options that need no torch, which takes seconds to load.
+"""Checks of options that need no torch: a command calls them first, because torch takes seconds to load."""
 
-The check of a command is beside it: `check_fit` in `fit.py`. `kgs.app.cli.run` calls it with all arguments of the
-command before anything heavy is loaded; the command itself checks the rest.
-"""
-
-import ctypes
-import sys
-from importlib.metadata import entry_points
-from importlib.util import find_spec
 from pathlib import Path
 
 from kgs._support.errors import DataError
@@ -15,9 +7,6 @@ from kgs.datasets import folders
 from kgs.datasets.options import held_out_between_ends
 
 SMALLEST = 32  # pixels of the longer side of a fit's photos
-_ALWAYS = ("torch", "kornia", "numpy", "cv2", "PIL")
-# Kinds of devices of torch; a plugin (entry point "torch.backends") may bring others.
-_DEVICES = ("cpu", "cuda", "mps", "xpu", "hpu", "mtia", "xla", "ipu", "hip", "ve", "maia", "lazy", "vulkan", "meta")
 
 
 def check_roll(roll: float) -> None:
@@ -36,35 +25,6 @@ def check_file(out: Path, ending: str, source: Path | None = None) -> None:
         raise ValueError(f"out: expected another file than {str(source)!r}, which is read")
     if not out.absolute().parent.is_dir():
         raise DataError(out, "", "expected a file in a folder that is there")
-
-
-def check_installed(device: str, backend: str, *packages: str) -> None:
-    """Raise a ModuleNotFoundError if a package is not installed, a ValueError if the device cannot be used."""
-    for package in (*_ALWAYS, *packages, *(["numba"] if backend == "numba" else [])):
-        if find_spec(package) is None:
-            raise ModuleNotFoundError(f"{package} is not installed", name=package)
-    if reason := _why_no_device(device.partition(":")[0]):
-        raise ValueError(f"device: expected cpu or a GPU of this machine, got {device!r} ({reason})")
-
-
-def _why_no_device(kind: str) -> str:
-    """Why torch cannot use a device of this kind; "" if it may, or if only torch itself can tell."""
-    if kind not in _DEVICES and not entry_points(group="torch.backends"):
-        return "torch knows cpu, cuda, mps, xpu and others"
-    if kind != "cuda":
-        return ""
-    spec = find_spec("torch")
-    build = Path(spec.origin).with_name("version.py") if spec and spec.origin else None
-    lines = build.read_text(encoding="utf-8").splitlines() if build and build.is_file() else []
-    made_for = {line.partition(":")[0].partition(" ")[0]: line.rpartition("= ")[2].strip() for line in lines}
-    if made_for.get("cuda") == "None" and made_for.get("hip", "None") == "None":
-        return "torch is installed without CUDA"
-    if sys.platform == "linux" and made_for.get("hip", "None") == "None":
-        try:
-            ctypes.CDLL("libcuda.so.1")
-        except OSError:
-            return "there is no driver of NVIDIA"
-    return ""
 
 
 def check_layout(scene: Path) -> None:

@@ -2,14 +2,16 @@
 
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from kgs._support.errors import DataError, printable
 from kgs.app.console import VIEWER, as_line, each, say, say_next
 from kgs.fit.config import Backend, Background
 
-from .inputs import check_tools, load_cameras, load_splat
-from .options import Existing, Out
+from .checks import check_file, check_results, check_scene
+from .inputs import load_cameras, load_splat
+from .options import IfGiven, Out
+from .tools import load_tools
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -20,13 +22,13 @@ if TYPE_CHECKING:
 
 
 def clean(
-    splat: Existing,
+    splat: Path,
     /,
     *,
     out: Out = Path("clean.ply"),
     strength: float = 1.0,
-    cameras: Existing | None = None,
-    downscale: float | None = None,
+    cameras: IfGiven[Path] = None,
+    downscale: IfGiven[float] = None,
     background: Background = "black",
     device: str = "cpu",
     backend: Backend = "auto",
@@ -52,6 +54,21 @@ def clean(
         device: cpu, cuda, ...
         backend: auto: that of the fit, or the fastest that is installed. kgs fit --help-all describes the others.
     """
+    from kgs.datasets.options import check_options
+
+    check_options(downscale, None)
+    check_file(out, ".ply", splat)
+    if cameras is not None:
+        check_scene(cameras)
+    if splat.is_dir():
+        for name, value in (("cameras", cameras), ("downscale", downscale)):
+            if value is not None:
+                raise ValueError(f"{name}: expected a PLY file as SPLAT, got a folder, which has its own scene")
+        check_results(splat)
+    elif cameras is None and downscale is not None:
+        raise ValueError("downscale: expected --cameras with it, got none")
+    torch_device = load_tools(device, backend)
+
     from kgs.app.files.publishing import replacing
     from kgs.app.saved_fit import load_fit
     from kgs.fit.clean import check_left, check_strength, find_strays
@@ -59,7 +76,6 @@ def clean(
     from kgs.ply import save_ply
 
     check_strength(strength)
-    torch_device = check_tools(device, backend)
     fit = None
     if splat.is_dir():
         request, fit = load_fit(splat, device, backend, say)
@@ -137,32 +153,3 @@ def _say_levels(fit: "Fit", cleaned: "Cleaned") -> None:
         levels = [one.psnr(test) for one in (cleaned.fit, fit)]
         if None not in levels:
             say(f" test: PSNR {levels[0]:.2f}, before {levels[1]:.2f}")
-
-
-def check_clean(
-    splat: Path,
-    out: Path,
-    strength: float,
-    cameras: Path | None,
-    downscale: float | None,
-    device: str,
-    backend: str,
-    **_: Any,
-) -> None:
-    """Check the arguments of `kgs clean`."""
-    from kgs.datasets.options import check_options
-
-    from .checks import check_file, check_installed, check_results, check_scene
-
-    check_options(downscale, None)
-    check_installed(device, backend)
-    check_file(out, ".ply", splat)
-    if cameras is not None:
-        check_scene(cameras)
-    if splat.is_dir():
-        for name, value in (("cameras", cameras), ("downscale", downscale)):
-            if value is not None:
-                raise ValueError(f"{name}: expected a PLY file as SPLAT, got a folder, which has its own scene")
-        check_results(splat)
-    elif cameras is None and downscale is not None:
-        raise ValueError("downscale: expected --cameras with it, got none")

@@ -9,8 +9,8 @@ from kgs._support.errors import DataError, printable
 from kgs.app.console import VIEWER, as_line, each, say, say_next
 from kgs.fit.config import DEMO, DEMO_STEPS, DROP, Backend, FitConfig
 
-from .inputs import check_tools
 from .options import Out
+from .tools import load_tools
 
 if TYPE_CHECKING:
     from kgs.datasets.scene import Scene
@@ -45,11 +45,18 @@ def demo(
         backend: auto: the fastest that is installed. kgs fit --help-all describes the others.
     """
     from kgs.app.files.outputs import check_folder
-    from kgs.datasets import synthetic_scene
+    from kgs.app.files.publishing import read_marker
 
     config = replace(DEMO, seed=seed, steps=steps, device=device, backend=backend)
-    check_tools(device, backend, "jinja2")
-    check_folder(out)
+    if min(size) < 12:  # the window of SSIM
+        raise ValueError(f"size: expected at least 12 pixels a side, got {size[0]} {size[1]}")
+    check_folder(out, make=False)
+    if "fit" in read_marker(out):
+        raise DataError(out, "", "holds the results of kgs fit: choose another folder")
+    load_tools(device, backend, "jinja2")
+
+    from kgs.datasets import synthetic_scene
+
     scene = synthetic_scene("room", train_views=3, test_views=3, size=size, seed=seed)
     runs = run_demo(scene, config, out, {"without": 0.0, "with": DROP} if compare else {"with": DROP})
     say(f"\n{'':22}{'PSNR':>8}{'SSIM':>8}{'train PSNR':>12}{'Gaussians':>11}{'seconds':>9}")
@@ -124,19 +131,3 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, floa
 def _level(measures: dict[str, Any]) -> float:
     """The PSNR among measures, in dB."""
     return math.inf if measures["psnr"] is None else float(measures["psnr"])
-
-
-def check_demo(out: Path, size: tuple[int, int], steps: int, device: str, backend: str, **_: Any) -> None:
-    """Check the arguments of `kgs demo`."""
-    from kgs.app.files.outputs import check_folder
-    from kgs.app.files.publishing import read_marker
-
-    from .checks import check_installed
-
-    FitConfig(steps=steps)
-    if min(size) < 12:  # the window of SSIM
-        raise ValueError(f"size: expected at least 12 pixels a side, got {size[0]} {size[1]}")
-    check_installed(device, backend, "jinja2")
-    check_folder(out, make=False)
-    if "fit" in read_marker(out):
-        raise DataError(out, "", "holds the results of kgs fit: choose another folder")

@@ -2,18 +2,18 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from kgs._support.errors import DataError, printable
 from kgs.app.console import as_line, say, say_next
 from kgs.fit.config import Backend
 
-from .inputs import check_tools
-from .options import Existing
+from .checks import check_results
+from .options import IfGiven
+from .tools import load_tools
 
 
 def evaluate(
-    out: Existing, /, *, lpips_weights: Existing | None = None, device: str = "cpu", backend: Backend = "auto"
+    out: Path, /, *, lpips_weights: IfGiven[Path] = None, device: str = "cpu", backend: Backend = "auto"
 ) -> None:
     """Measure a fit again, and update its metrics.json and its page.
 
@@ -29,6 +29,13 @@ def evaluate(
         device: cpu, cuda, ...
         backend: auto: that of the fit. kgs fit --help-all describes the others.
     """
+    from kgs.metrics.weights import weight_files
+
+    if lpips_weights is not None:
+        weight_files(lpips_weights)
+    check_results(out)
+    load_tools(device, backend, "jinja2")
+
     from kgs._support.json_files import read_json, write_json
     from kgs.app.files.locks import locked
     from kgs.app.files.publishing import replacing
@@ -37,7 +44,6 @@ def evaluate(
     from kgs.metrics.evaluate import as_text, measure_again
     from kgs.metrics.lpips import Lpips
 
-    check_tools(device, backend, "jinja2")
     lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(device)
     request, fit = load_fit(out, device, backend, say)
     path = out / "metrics.json"
@@ -50,15 +56,3 @@ def evaluate(
     say(as_text(metrics))
     say(f"{printable(path)} and {printable(out / PAGE)} are up to date")
     say_next(f"open {as_line(out / PAGE)} in a browser")
-
-
-def check_evaluate(out: Path, lpips_weights: Path | None, device: str, backend: str, **_: Any) -> None:
-    """Check the arguments of `kgs eval`."""
-    from kgs.metrics.weights import weight_files
-
-    from .checks import check_installed, check_results
-
-    check_installed(device, backend, "jinja2")
-    if lpips_weights is not None:
-        weight_files(lpips_weights)
-    check_results(out)

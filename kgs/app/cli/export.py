@@ -1,16 +1,17 @@
 """`kgs export`: a splat in fewer bytes, for viewers in browsers."""
 
 from pathlib import Path
-from typing import Any
 
-from kgs._support.errors import printable
+from kgs._support.errors import DataError, printable
 from kgs.app.console import VIEWER, as_line, say, say_next
 
-from .options import Existing, Out
+from .checks import check_file
+from .options import Out
+from .tools import load_tools
 
 
 def export(
-    ply: Existing,
+    ply: Path,
     /,
     *,
     out: Out = Path("splat.compressed.ply"),
@@ -31,9 +32,11 @@ def export(
         origin: a point that becomes the origin, x y z: one near the Gaussians of a splat in map coordinates, which
             viewers cannot show there.
     """
+    check_file(out, ".ply", ply)
+    load_tools()
+
     import torch
 
-    from kgs._support.errors import DataError
     from kgs.app.files.publishing import replacing
     from kgs.compressed_ply import save_compressed_ply
     from kgs.ply import load_ply
@@ -46,11 +49,3 @@ def export(
     sizes = [path.stat().st_size / 1e6 for path in (out, ply)]
     say(f"{printable(out)}: {len(model)} Gaussians, {sizes[0]:.2f} MB of {sizes[1]:.2f}")
     say_next(VIEWER.format(as_line(out)))
-
-
-def check_export(ply: Path, out: Path, **_: Any) -> None:
-    """Check the arguments of `kgs export`."""
-    from .checks import check_file, check_installed
-
-    check_installed("cpu", "auto")
-    check_file(out, ".ply", ply)

@@ -1,12 +1,13 @@
 """`kgs fit`: from a folder of photos to a splat."""
 
+import inspect
 import os
 import re
 import warnings
-from dataclasses import replace
+from dataclasses import MISSING, field, make_dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_type_hints
 
 import tyro
 
@@ -14,15 +15,21 @@ from kgs._support.errors import DataError, printable
 from kgs.app.console import VIEWER, as_line, say, say_next
 from kgs.fit.config import COARSE, DETAILS, PRESETS, Background, FitConfig, min_side
 
-from .inputs import check_tools
-from .options import Existing, Out, options_in
+from .checks import SMALLEST, check_photos, check_roll, check_scene
+from .options import QUIET, IfGiven, On, Out, options_in
+from .tools import check_installed, load_tools
+from .unposed import find_scene, is_unposed, on_ctrl_c
+
+# The short help shows these entries of FitConfig, and all other options of the command but the rare ones.
+_OF_CONFIG = ("steps", "drop", "refine_poses", "seed", "device")
+_RARE = ("downscale", "lpips_weights", "mask_mode", "frames", "title", "live", "config")
 
 
-def defaults(words: list[str]) -> dict[str, Any]:
+def first_config(words: list[str]) -> FitConfig:
     """The default of `config`, which follows from --preset and --detail."""
     preset = PRESETS.get(_value(words, "--preset"), PRESETS["auto"])
     detail = DETAILS.get(_value(words, "--detail"), DETAILS["normal"])
-    return {"config": replace(preset, **detail.entries)}
+    return replace(preset, **detail.entries)
 
 
 def _value(words: list[str], option: str) -> str:
@@ -37,25 +44,25 @@ def _value(words: list[str], option: str) -> str:
 
 
 def fit(
-    scene: Existing,
+    scene: Path,
     /,
     *,
     out: Out,
-    views: int | None = None,
-    hold_out: int | None = None,
-    size: int | str | None = None,
-    downscale: float | None = None,
+    views: IfGiven[int] = None,
+    hold_out: IfGiven[int] = None,
+    size: IfGiven[int | str] = None,
+    downscale: IfGiven[float] = None,
     background: Background = "black",
-    frames: int | None = None,
-    masks: Existing | None = None,
+    frames: IfGiven[int] = None,
+    masks: IfGiven[Path] = None,
     mask_mode: Literal["ignore", "transparent"] = "ignore",
     preset: Literal["auto", "paper", "plain"] = "auto",
     detail: Literal["low", "normal", "high"] = "normal",
     resume: bool = False,
-    title: str | None = None,
-    photos: bool = True,
+    title: IfGiven[str] = None,
+    photos: On = True,
     roll: float = 0.0,
-    lpips_weights: Existing | None = None,
+    lpips_weights: IfGiven[Path] = None,
     live: bool = False,
     config: Annotated[FitConfig, tyro.conf.arg(name="")],
 ) -> int:
@@ -94,22 +101,44 @@ def fit(
         live: show the splat as it grows on a page on this machine, until the fit ends; a line says its address.
         config: every number of the fit.
     """
+    from kgs.app.files.outputs import check_folder
+    from kgs.datasets.folders import CAMERAS_REPORT, layout_of
+    from kgs.datasets.options import check_options
+    from kgs.metrics.weights import weight_files
+
+    unposed = is_unposed(scene)
+    check_roll(roll)
+    _check_size(size, downscale, unposed)
+    if views is not None and views < 1:
+        raise ValueError(f"views: expected a whole number of at least 1, got {views}")
+    check_options(downscale, hold_out)
+    _check_frames(frames, scene)
+    if lpips_weights is not None:
+        weight_files(lpips_weights)
+    check_folder(out, scene, make=False)
+    if unposed:
+        check_installed("pycolmap")
+        pixels = size if isinstance(size, int) else None
+        shortest = min_side(config, lpips_weights is not None)
+        check_photos(scene, out, views, hold_out, pixels, downscale, frames, shortest)
+    else:
+        check_scene(scene)
+    if config.init == "scene" and (unposed or layout_of(scene) != "Blender"):
+        kind = "photos without camera poses" if unposed else f"the layout {layout_of(scene)}"
+        raise ValueError(f"init: expected another one for {kind}, got 'scene', Blender's points")
+    load_tools(config.device, config.backend, "safetensors", "jinja2")
+
     from kgs.app.fit_folder import fit_folder
     from kgs.app.scene_request import SceneRequest
     from kgs.app.stages import Stages
     from kgs.datasets import load_scene
     from kgs.datasets.field import field_size
-    from kgs.datasets.folders import CAMERAS_REPORT
     from kgs.fit.decisions import Decisions
     from kgs.fit.prune import left_out
     from kgs.init_points.files import read_points
     from kgs.metrics.evaluate import as_text
     from kgs.metrics.lpips import Lpips
 
-    from .checks import SMALLEST
-    from .unposed import find_scene, is_unposed, on_ctrl_c
-
-    check_tools(config.device, config.backend, "safetensors", "jinja2")
     if config.init_file is not None:
         with warnings.catch_warnings(action="ignore"):
             read_points(config.init_file)  # an error now, not once there are cameras
@@ -128,7 +157,6 @@ def fit(
         mask_mode=mask_mode,
     )
     base = out
-    unposed = is_unposed(scene)
     is_free = size is None and downscale is None  # the size follows from --detail
     stages = Stages(say, unposed)
     if is_free and (detail != "normal" or (unposed and config.device == "cpu")):
@@ -189,62 +217,44 @@ def fit(
     return 0
 
 
-def check_fit(
-    scene: Path,
-    out: Path,
-    views: int | None,
-    hold_out: int | None,
-    size: int | str | None,
-    downscale: float | None,
-    frames: int | None,
-    roll: float,
-    lpips_weights: Path | None,
-    config: FitConfig,
-    **_: Any,
-) -> None:
-    """Check the arguments of `kgs fit`."""
-    from kgs.app.files.outputs import check_folder
-    from kgs.app.sfm.find import MIN_PHOTOS, find_video
-    from kgs.datasets.folders import layout_of
-    from kgs.datasets.options import check_options
-    from kgs.metrics.weights import weight_files
+def short_help(config: FitConfig) -> type[Any]:
+    """A class that has the options of the short help, with the numbers of `config`: tyro describes it as `fit`."""
+    entries = list[tuple[str, Any, Any]]()
+    hints = get_type_hints(fit, include_extras=True)
+    for name, parameter in inspect.signature(fit).parameters.items():
+        is_named = parameter.kind is parameter.KEYWORD_ONLY
+        hint = hints[name] if is_named else Annotated[hints[name], tyro.conf.Positional]
+        default = MISSING if parameter.default is parameter.empty else parameter.default
+        if name not in _RARE:
+            entries.append((name, hint, field(default=default)))
+    hints = get_type_hints(FitConfig, include_extras=True)
+    for name in _OF_CONFIG:
+        value = getattr(config, name)
+        hint = Annotated[hints[name], QUIET] if value is None else hints[name]
+        entries.append((name, hint, field(default=value)))
+    kind: type[Any] = make_dataclass("ShortHelp", entries, kw_only=True)
+    of_config = inspect.cleandoc(FitConfig.__doc__ or "").partition("Args:")[2]
+    kind.__doc__ = inspect.cleandoc(fit.__doc__ or "") + of_config
+    return kind
 
-    from .checks import SMALLEST, check_installed, check_photos, check_roll, check_scene
-    from .unposed import is_unposed
 
-    check_roll(roll)
+def _check_size(size: int | str | None, downscale: float | None, unposed: bool) -> None:
+    """Raise a ValueError unless the photos can have this size."""
     if size is not None and downscale is not None:
         raise ValueError("size: expected either a size or a downscale factor, got both")
     if isinstance(size, str) and re.fullmatch(r"field|images(_\d+)?", size) is None:
         raise ValueError(f"size: expected pixels, field or a folder as images_8, got {size!r}")
+    if isinstance(size, str) and unposed:
+        raise ValueError(f"size: expected pixels for photos without camera poses, got {size!r}")
     if isinstance(size, int) and size < SMALLEST:
         raise ValueError(f"size: expected at least {SMALLEST} pixels, got {size}")
-    if views is not None and views < 1:
-        raise ValueError(f"views: expected a whole number of at least 1, got {views}")
-    check_options(downscale, hold_out)
+
+
+def _check_frames(frames: int | None, scene: Path) -> None:
+    """Raise a ValueError unless so many frames can be taken from a video."""
+    from kgs.app.sfm.find import MIN_PHOTOS, find_video
+
     if frames is not None and frames < MIN_PHOTOS:
         raise ValueError(f"frames: expected at least {MIN_PHOTOS}, got {frames}")
     if frames is not None and find_video(scene) is None:
         raise ValueError("frames: expected a video to take them from, got photos")
-    unposed = is_unposed(scene)
-    if unposed and isinstance(size, str):
-        raise ValueError(f"size: expected pixels for photos without camera poses, got {size!r}")
-    solver = ["pycolmap"] if unposed else []
-    check_installed(config.device, config.backend, "safetensors", "jinja2", *solver)
-    if lpips_weights is not None:
-        weight_files(lpips_weights)
-    check_folder(out, scene, make=False)
-    if unposed:
-        if config.init == "scene":
-            raise ValueError(
-                "init: expected another one for photos without camera poses, got 'scene', Blender's points"
-            )
-        assert not isinstance(size, str)
-        shortest = min_side(config, lpips_weights is not None)
-        check_photos(scene, out, views, hold_out, size, downscale, frames, shortest)
-    else:
-        check_scene(scene)
-        if config.init == "scene" and layout_of(scene) != "Blender":
-            raise ValueError(
-                f"init: expected another one for the layout {layout_of(scene)}, got 'scene', Blender's points"
-            )

@@ -14,17 +14,6 @@ if TYPE_CHECKING:
     from kgs.fit.fit import Fit
 
 
-def check_tools(device: str, backend: str, *packages: str) -> "torch.device":
-    """The device; raises if it, the backend or a package that a command needs is missing."""
-    from kgs._support.machine import check_device, check_packages
-    from kgs.backends import resolve
-
-    found = check_device(device)
-    resolve(backend, found)
-    check_packages(*packages)
-    return found
-
-
 def load_cameras(cameras: Path, downscale: float | None, photos: bool = False, **options: Any) -> "Scene":
     """The scene without its photos, of which there may be hundreds, or with them; all views are training views."""
     from kgs.datasets import load_scene

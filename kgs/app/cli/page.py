@@ -2,28 +2,30 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from kgs._support.errors import printable
 from kgs.app.console import as_line, say, say_next
 from kgs.fit.config import Backend, Background
 
-from .inputs import check_tools, load_cameras, load_splat
-from .options import Existing, Out
+from .checks import check_file, check_roll, check_scene
+from .inputs import load_cameras, load_splat
+from .options import IfGiven, On, Out
+from .tools import load_tools
 
 if TYPE_CHECKING:
     from kgs.datasets.scene import Scene, Views
 
 
 def page(
-    ply: Existing,
+    ply: Path,
     /,
     *,
-    cameras: Existing,
+    cameras: Path,
     out: Out = Path("index.html"),
-    downscale: float | None = None,
+    downscale: IfGiven[float] = None,
     background: Background = "black",
-    photos: bool = True,
+    photos: On = True,
     roll: float = 0.0,
     device: str = "cpu",
     backend: Backend = "auto",
@@ -46,6 +48,14 @@ def page(
         device: cpu, cuda, ...
         backend: auto: the fastest that is installed. kgs fit --help-all describes the others.
     """
+    from kgs.datasets.options import check_options
+
+    check_roll(roll)
+    check_options(downscale, None)
+    check_file(out, ".html")
+    check_scene(cameras)
+    torch_device = load_tools(device, backend, "jinja2")
+
     from kgs._support.machine import versions
     from kgs.app.files.publishing import replacing
     from kgs.app.page.fit_page import MAX_PICTURES, load_small, spread, write_fit_page
@@ -53,7 +63,6 @@ def page(
     from kgs.losses.photometric import WINDOW
     from kgs.metrics.evaluate import evaluate
 
-    torch_device = check_tools(device, backend, "jinja2")
     scene = load_cameras(cameras, downscale, background=background)
     height, width = scene.train.images.shape[-2:]
     if min(height, width) < WINDOW:
@@ -93,18 +102,3 @@ def in_frame_of(scene: "Scene", again: "Scene") -> "Views":
     extrinsics[:, :3, 3] += extrinsics[:, :3, :3] @ shift
     height, width = views.images.shape[-2:]
     return replace(views, cameras=pinholes(views.cameras.intrinsics, extrinsics.float(), (height, width)))
-
-
-def check_page(
-    cameras: Path, out: Path, downscale: float | None, roll: float, device: str, backend: str, **_: Any
-) -> None:
-    """Check the arguments of `kgs page`."""
-    from kgs.datasets.options import check_options
-
-    from .checks import check_file, check_installed, check_roll, check_scene
-
-    check_roll(roll)
-    check_options(downscale, None)
-    check_installed(device, backend, "jinja2")
-    check_file(out, ".html")
-    check_scene(cameras)

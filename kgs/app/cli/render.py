@@ -1,23 +1,25 @@
 """`kgs render`: pictures of a splat."""
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from kgs._support.errors import printable
 from kgs.app.console import VIEWER, as_line, each, say, say_next
 from kgs.fit.config import Backend, Background
 
-from .inputs import check_tools, load_cameras, load_splat
-from .options import Existing, Out
+from .checks import check_layout
+from .inputs import load_cameras, load_splat
+from .options import IfGiven, Out
+from .tools import load_tools
 
 
 def render(
-    ply: Existing,
+    ply: Path,
     /,
     *,
-    cameras: Existing,
+    cameras: Path,
     out: Out,
-    downscale: float | None = None,
+    downscale: IfGiven[float] = None,
     background: Literal[Background, "transparent"] = "black",
     device: str = "cpu",
     backend: Backend = "auto",
@@ -39,21 +41,26 @@ def render(
         device: cpu, cuda, ...
         backend: auto: the fastest that is installed. kgs fit --help-all describes the others.
     """
+    from kgs.app.files.outputs import check_folder, png_names, write_png
+    from kgs.datasets.options import check_options
+
+    check_options(downscale, None)
+    check_folder(out, cameras, make=False)
+    check_layout(cameras)
+    torch_device = load_tools(device, backend)
+
     import torch
 
     from kgs.app.files.cameras import as_taken
-    from kgs.app.files.outputs import check_folder, png_names, write_png
     from kgs.app.files.publishing import replacing
     from kgs.camera import move_camera
     from kgs.renderer import GaussianRenderer
 
-    torch_device = check_tools(device, backend)
     is_transparent = background == "transparent"
     scene = load_cameras(cameras, downscale, background="black" if is_transparent else background)
     fit = load_splat(ply, scene, torch_device, backend)
     renderer = GaussianRenderer(options=fit.options, backend=backend).eval()
     names = png_names(scene.train.names)
-    check_folder(out, scene.root)
     color = scene.background.to(torch_device)
     outputs = ("image", "alpha") if is_transparent else ("image",)
     with replacing(out, "renders") as new, torch.no_grad():
@@ -65,16 +72,3 @@ def render(
             write_png(new / names[name], as_taken(image[0], scene.train, i))
     say(f"{len(names)} pictures in {printable(out)}")
     say_next(VIEWER.format(as_line(ply)))
-
-
-def check_render(cameras: Path, out: Path, downscale: float | None, device: str, backend: str, **_: Any) -> None:
-    """Check the arguments of `kgs render`."""
-    from kgs.app.files.outputs import check_folder
-    from kgs.datasets.options import check_options
-
-    from .checks import check_installed, check_layout
-
-    check_options(downscale, None)
-    check_installed(device, backend)
-    check_folder(out, cameras, make=False)
-    check_layout(cameras)

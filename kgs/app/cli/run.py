@@ -1,51 +1,45 @@
-"""Finds a command, reads its options, calls it, and turns what goes wrong into a line and an exit code."""
+"""Finds a command, reads its options, calls it, and turns what goes wrong into a line and an exit code.
+
+tyro reads one command at a time. With its subcommands `kgs --help` would have 100 lines, and take more than twice as
+long, because the options of all commands would be read.
+"""
 
 import difflib
 import errno
 import inspect
+import pkgutil
 import re
 import sys
-import traceback
 import warnings
 from collections.abc import Callable
 from dataclasses import fields
-from functools import partial
-from importlib import import_module
+from functools import partial, wraps
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from kgs._support.errors import DataError, TrainingDiverged, printable
 from kgs.app.console import as_line, say
 from kgs.fit.config import FitConfig, Recipe
 
 from .interrupts import interrupt_as_usual
+from .tools import explain_import_error
 
-# The module and the function in it that are a command.
-_COMMANDS = {
-    "demo": ("kgs.app.cli.demo", "demo"),
-    "fit": ("kgs.app.cli.fit", "fit"),
-    "render": ("kgs.app.cli.render", "render"),
-    "eval": ("kgs.app.cli.evaluate", "evaluate"),
-    "page": ("kgs.app.cli.page", "page"),
-    "clean": ("kgs.app.cli.clean", "clean"),
-    "scale": ("kgs.app.cli.scale", "scale"),
-    "export": ("kgs.app.cli.export", "export"),
-    "check": ("kgs.app.cli.check", "check"),
-    "bench speed": ("kgs.app.cli.bench", "speed"),
-    "bench precision": ("kgs.app.cli.bench", "precision"),
-    "bench extremes": ("kgs.app.cli.bench", "extremes"),
-    "study": ("kgs.study.command", "study"),
+COMMANDS = {
+    "demo": "kgs.app.cli.demo:demo",
+    "fit": "kgs.app.cli.fit:fit",
+    "render": "kgs.app.cli.render:render",
+    "eval": "kgs.app.cli.evaluate:evaluate",
+    "page": "kgs.app.cli.page:page",
+    "clean": "kgs.app.cli.clean:clean",
+    "scale": "kgs.app.cli.scale:scale",
+    "export": "kgs.app.cli.export:export",
+    "check": "kgs.app.cli.check:check",
+    "bench speed": "kgs.app.cli.bench:speed",
+    "bench precision": "kgs.app.cli.bench:precision",
+    "bench extremes": "kgs.app.cli.bench:extremes",
+    "study": "kgs.study.command:study",
 }
-_HEAVY = ("torch", "kornia", "cv2", "numba")
-_EXTRAS = {
-    "numba": "fast",
-    "pi_heif": "heic",
-    "pycolmap": "sfm",
-    "distributed": "study",
-    "pandas": "study",
-    "scipy": "study",
-}
-USER_ERRORS = {
+_USER_ERRORS = {
     errno.EACCES,
     errno.EEXIST,
     errno.EISDIR,
@@ -54,7 +48,8 @@ USER_ERRORS = {
     errno.ENOTDIR,
     errno.EROFS,
 }
-_OTHER_NAMES = {"train_views": "views"}  # arguments of the library, and their options
+_HELP_ALL = {"--help-all", "--help_all"}
+_HELP = {"-h", "--help"}
 
 
 def exit_code(words: list[str]) -> int:
@@ -64,22 +59,16 @@ def exit_code(words: list[str]) -> int:
     code = 2
     try:
         name, words = _find(words)
-        command, defaults = _load(name)
+        command = load_command(name)
         flags = _flags_of(command)
-        call = _parse(command, f"kgs {name}", words, defaults(words))
-        _check(name, call)
-        for module in _HEAVY:
-            _import(module)
-        interrupt_as_usual()
+        call = _parse(command, name, words)
         return int(call() or 0)
     except SystemExit as stop:
         if not isinstance(stop.code, str):
             return stop.code or 0
         message = stop.code
-    except ModuleNotFoundError as error:
-        message = _of_a_missing_package(error)
     except ImportError as error:
-        message = _of_a_broken_package(error)
+        message = explain_import_error(error)
     except DataError as error:
         message = str(DataError(error.path, flags.get(error.field, error.field), error.reason))
     except ValueError as error:
@@ -95,9 +84,10 @@ def exit_code(words: list[str]) -> int:
     except OSError as error:
         prefix = f"{printable(error.filename)}: " if error.filename else ""
         message = f"{prefix}{error.strerror}"
-        code = 2 if error.errno in USER_ERRORS else 1
+        code = 2 if error.errno in _USER_ERRORS else 1
     except (MemoryError, RuntimeError) as error:
-        if not _is_out_of_memory(error):
+        is_memory = isinstance(error, MemoryError) or any(word in str(error) for word in ("allocate", "of memory"))
+        if not is_memory:  # torch and CUDA say so in a RuntimeError
             raise
         message = f"not enough memory: {error}".partition("\n")[0]
         code = 1
@@ -110,72 +100,24 @@ def exit_code(words: list[str]) -> int:
     return code
 
 
-def _is_out_of_memory(error: Exception) -> bool:
-    """Whether memory was too short; torch and CUDA say so in a RuntimeError."""
-    return isinstance(error, MemoryError) or any(cause in str(error) for cause in ("allocate", "of memory"))
-
-
-def _of_a_missing_package(error: ModuleNotFoundError) -> str:
-    """Message for a package that is not installed; it names the extra that brings it."""
-    package = (error.name or "").partition(".")[0]
-    if package == "kgs":
-        raise error
-    if package == "triton":  # torch brings it
-        return str(error)
-    extra = _EXTRAS.get(package, "app")
-    return (
-        f'{error.name} is missing: run pip install -e ".[{extra}]" in a clone of kgs, '
-        f'or pip install "kgs-splat[{extra}]" where an index has it'
-    )
-
-
-def _import(module: str) -> None:
-    """Import a large package. A missing one, or a broken numba, is left to the command that needs it."""
-    try:
-        import_module(module)
-    except ModuleNotFoundError:
-        pass
-    except (ImportError, OSError) as error:  # torch loads its libraries itself
-        if module != "numba":
-            raise ImportError(str(error), name=module) from error
-
-
-def _of_a_broken_package(error: ImportError) -> str:
-    """Message for an installed package that fails to import."""
-    names = [frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__)]
-    tops = [name.partition(".")[0] for name in [error.name or "", *names]]
-    package = next((top for top in tops if top not in ("", "kgs", *sys.stdlib_module_names)), "")
-    if not package:  # a mistake in kgs
-        raise error
-    from importlib.metadata import packages_distributions
-
-    project = packages_distributions().get(package, [package])[0]
-    reason = printable(str(error).strip().partition("\n")[0].rstrip("."))
-    return (
-        f"{package} is installed, but cannot be loaded ({reason}): run pip install --force-reinstall {project} "
-        f"(of the extra {_EXTRAS.get(package, 'app')})"
-    )
-
-
 def _find(words: list[str]) -> tuple[str, list[str]]:
     """Split the words of a command line into the name of the command and the rest."""
     if words[:1] == ["--version"]:
         _say_versions()
         raise SystemExit(0)
-    group = "bench" if words[:1] == ["bench"] else ""
-    prefix = f"{group} " if group else ""
+    prefix = "bench " if words[:1] == ["bench"] else ""
     name, *rest = words[len(prefix.split()) :] or ["--help"]
-    names = [each.removeprefix(prefix) for each in _COMMANDS if each.startswith(prefix)]
-    if name in ("-h", "--help"):
+    if name in _HELP:
         _say_commands(prefix)
         raise SystemExit(0)
-    if name not in names:
-        known = list(dict.fromkeys(each.partition(" ")[0] for each in names))
-        near = difflib.get_close_matches(name, known, 1)
-        meant = f": did you mean {near[0]}?" if near else ""
-        whole = f"kgs {group}".strip()
-        raise SystemExit(f"expected a command of {whole}, one of {', '.join(known)}, got {printable(name)!r}{meant}")
-    return prefix + name, rest
+    if prefix + name in COMMANDS:
+        return prefix + name, rest
+    names = [each.removeprefix(prefix).partition(" ")[0] for each in COMMANDS if each.startswith(prefix)]
+    known = list(dict.fromkeys(names))
+    near = difflib.get_close_matches(name, known, 1)
+    meant = f": did you mean {near[0]}?" if near else ""
+    group = f"kgs {prefix}".strip()
+    raise SystemExit(f"expected a command of {group}, one of {', '.join(known)}, got {printable(name)!r}{meant}")
 
 
 def _say_versions() -> None:
@@ -187,96 +129,84 @@ def _say_versions() -> None:
 
 def _say_commands(prefix: str) -> None:
     lines = [f"usage: kgs {prefix}COMMAND ...", ""]
-    for name in _COMMANDS:
+    for name in COMMANDS:
         if name.startswith(prefix):
-            summary = str(_load(name)[0].__doc__).partition("\n")[0]
+            summary = str(load_command(name).__doc__).partition("\n")[0]
             lines.append(f"  {name.removeprefix(prefix):<16} {summary}")
     say("\n".join([*lines, "", f"kgs {prefix}COMMAND --help lists the options and gives examples."]))
 
 
-def _load(name: str) -> tuple[Callable[..., Any], Callable[[list[str]], dict[str, Any]]]:
-    """The function of a command, and the function that derives defaults from its words."""
-    module, function = _COMMANDS[name]
-    home = import_module(module)
-    return getattr(home, function), getattr(home, "defaults", lambda _: {})
-
-
-def _check(name: str, call: partial[Any]) -> None:
-    """Report mistakes that need no torch."""
-    module, function = _COMMANDS[name]
-    check = getattr(import_module(module), f"check_{function}", None)
-    if check is not None:
-        bound = inspect.signature(call.func).bind(*call.args, **call.keywords)
-        bound.apply_defaults()
-        check(**bound.arguments)
+def load_command(name: str) -> Callable[..., Any]:
+    """The function that is a command."""
+    command: Callable[..., Any] = pkgutil.resolve_name(COMMANDS[name])
+    # tyro keeps the line breaks of a function's docstring: describe each argument in one line
+    command.__doc__ = re.sub(r"\n {8}(?=\S)", " ", inspect.cleandoc(command.__doc__ or ""))
+    return command
 
 
 def _flags_of(command: Callable[..., Any]) -> dict[str, str]:
     """The options of a command by the names of arguments, which errors of the library begin with."""
-    parameters = inspect.signature(command).parameters
-    recipe = [entry.name for entry in fields(Recipe)] if "config" in parameters else []
-    config = [entry.name for entry in fields(FitConfig)] if "config" in parameters else []
-    own = [name for name, parameter in parameters.items() if parameter.kind is parameter.KEYWORD_ONLY]
-    paths = {
-        **{name: f"recipe.{name}" for name in recipe},
-        **{f"recipe.{name}": f"recipe.{name}" for name in recipe},
-        **{name: name for name in (*config, *own)},  # `steps` is that of the fit
-        **_OTHER_NAMES,
-    }
+    parameters = inspect.signature(command).parameters.values()
+    own = [parameter.name for parameter in parameters if parameter.kind is parameter.KEYWORD_ONLY]
+    paths = {name: name for name in own}
+    if "config" in own:
+        recipe = {entry.name: f"recipe.{entry.name}" for entry in fields(Recipe)}
+        config = {entry.name: entry.name for entry in fields(FitConfig)}
+        paths = {**recipe, **{path: path for path in recipe.values()}, **config, **paths}  # `steps` is that of the fit
+    paths["train_views"] = "views"
     return {name: "--" + path.replace("_", "-") for name, path in paths.items()}
 
 
-def _check_out(command: Callable[..., Any], prog: str, words: list[str]) -> None:
+def _check_out(command: Callable[..., Any], name: str, words: list[str]) -> None:
     """Refuse a command line that lacks nothing but the folder for the results, and suggest one."""
     out = inspect.signature(command).parameters.get("out")
-    asked = ("--out", "-h", "--help", "--help-all", "--help_all")
+    asked = {"--out", *_HELP, *_HELP_ALL}
     is_given = any(word in asked or word.startswith("--out=") or word[:2] == "-o" for word in words)
     is_needed = out is not None and out.kind is out.KEYWORD_ONLY and out.default is out.empty
     if is_given or not is_needed or "--" in words or not words or words[0].startswith("-"):
         return
     if not words[0]:
         raise ValueError(f"{next(iter(inspect.signature(command).parameters))}: expected a path, got ''")
-    name = f"{Path(words[0]).resolve().stem}-{prog.rpartition(' ')[2]}"
-    whole = as_line(*prog.split(), *words, "-o", name)
+    folder = f"{Path(words[0]).resolve().stem}-{name.rpartition(' ')[2]}"
+    whole = as_line("kgs", *name.split(), *words, "-o", folder)
     raise SystemExit(f"-o: expected a folder for the results, for example {whole}")
 
 
-def _parse(command: Callable[..., Any], prog: str, words: list[str], defaults: dict[str, Any]) -> partial[Any]:
-    """Read the options; returns the call that they ask for, once its input paths are there."""
+def _parse(command: Callable[..., Any], name: str, words: list[str]) -> partial[Any]:
+    """Read the options, or say what they are; returns the call that they ask for."""
     import tyro
 
-    from .options import EXISTS, PATHS, EmptyPath, describe, has_short_help, options_in, short
+    from .options import EMPTY, PATHS, options_in
 
-    _check_out(command, prog, words)
-    asked = options_in(words)
-    if {"--help-all", "--help_all"} & {*asked}:
-        words = ["--help" if word in ("--help-all", "--help_all") else word for word in asked]
-    elif has_short_help(command) and {"-h", "--help"} & {*asked}:
-        try:
-            plain = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)
-            tyro.cli(short(command, defaults["config"]), prog=prog, args=["--help"], config=plain)
-        finally:
-            say(f"{prog} --help-all shows all options")
+    _check_out(command, name, words)
+    prog = f"kgs {name}"
+    asked = {*options_in(words)}
+    plain = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)  # an option that is not given is None
 
-    markers = [tyro.conf.FlagCreatePairsOff]
-    if not has_short_help(command):
-        markers.append(tyro.conf.DisallowNone)  # an option that is not given is None
-
+    @wraps(command)
     def bind(*arguments: Any, **options: Any) -> partial[Any]:
-        bound = inspect.signature(command).bind(*arguments, **options)
-        for name, value in bound.arguments.items():
-            hint = command.__annotations__[name]
-            path = value if any(EXISTS in get_args(part) for part in (hint, *get_args(hint))) else None  # or optional
-            if isinstance(value, FitConfig):
-                name, path = "init_file", value.init_file
-            if EmptyPath in (type(value), type(path)):
-                raise ValueError(f"{name}: expected a path, got ''")
-            if path is not None and not path.exists():
-                raise DataError(path, "", f"expected {EXISTS}, found none")
+        bound = inspect.signature(command).bind(*arguments, **options).arguments
+        config = bound.get("config")
+        for option, value in [*bound.items(), ("init_file", config and config.init_file)]:
+            if value is EMPTY:
+                raise ValueError(f"{option}: expected a path, got ''")
         return partial(command, *arguments, **options)
 
-    describe(bind, command)
-    function = partial(bind, **defaults) if defaults else bind
+    function: Callable[..., partial[Any]] = bind
+    if name == "fit":
+        from .fit import first_config, short_help
+
+        config = first_config(words)
+        if asked & _HELP and not asked & _HELP_ALL:
+            try:
+                tyro.cli(short_help(config), prog=prog, args=["--help"], config=plain)
+            finally:
+                say(f"{prog} --help-all shows all options")
+        function = partial(bind, config=config)
     with PATHS:
-        call: partial[Any] = tyro.cli(function, prog=prog, args=words, config=markers)
-    return call
+        return tyro.cli(
+            function,
+            prog=prog,
+            args=["--help"] if asked & _HELP_ALL else words,
+            config=plain[:1] if name == "fit" else plain,  # None undoes what a preset sets
+        )

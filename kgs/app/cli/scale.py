@@ -2,18 +2,16 @@
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from kgs._support.errors import DataError, printable
 from kgs.app.console import as_line, say, say_next
 
-from .options import Existing, Out
+from .checks import check_file, check_results
+from .options import Out
+from .tools import load_tools
 
-if TYPE_CHECKING:
-    from torch import Tensor
 
-
-def scale(splat: Existing, /, *, by: tuple[str, str, float], out: Out) -> None:
+def scale(splat: Path, /, *, by: tuple[str, str, float], out: Out) -> None:
     """Scale a splat and its cameras, so that two points are a known length apart.
 
     Measure, on the page of a fit under More, gives the points. The unit of the length is then that of the splat.
@@ -28,14 +26,17 @@ def scale(splat: Existing, /, *, by: tuple[str, str, float], out: Out) -> None:
         out: folder for splat.ply, splat.compressed.ply, splat.glb, cameras.json and index.html; for a PLY file the PLY
             file to write.
     """
-    import torch
-
     a, b, length = by
-    factor = length / math.dist(_point(a), _point(b))
+    if not (math.isfinite(length) and length > 0):
+        raise ValueError(f"by: expected a length above 0, got {length:g}")
+    distance = math.dist(_point(a), _point(b))
+    if not (0 < distance < math.inf and 0 < length / distance < math.inf):
+        raise ValueError(f"by: expected two points that can be {length:g} apart, got {a} and {b}")
+    factor = length / distance
     if splat.is_dir():
         _scale_folder(splat, out, factor, length)
     else:
-        _scale_ply(splat, out, factor, torch.tensor(_point(a), dtype=torch.float64))
+        _scale_ply(splat, out, factor, _point(a))
     say(f"{printable(out)}: {factor:.6g} times as large")
     if splat.is_dir():
         say_next(f"open {as_line(out / 'index.html')} in a browser")
@@ -43,16 +44,21 @@ def scale(splat: Existing, /, *, by: tuple[str, str, float], out: Out) -> None:
 
 def _scale_folder(folder: Path, out: Path, factor: float, length: float) -> None:
     """Write the files of a fit in the new unit; the fit stays as it is."""
-    from kgs._support.machine import check_packages
-    from kgs.app.files.exports import write_splat_exports
     from kgs.app.files.outputs import check_folder
-    from kgs.app.files.publishing import replacing
+    from kgs.app.files.publishing import read_marker, replacing
+
+    check_results(folder)
+    check_folder(out, make=False)
+    if "fit" in read_marker(out):
+        raise DataError(out, "", "holds the results of kgs fit: choose another folder")
+    load_tools("cpu", "auto", "jinja2", "safetensors")
+
+    from kgs.app.files.exports import write_splat_exports
     from kgs.app.page.fit_page import write_own_page
     from kgs.app.saved_fit import load_fit
     from kgs.fit.scale import scaled
     from kgs.ply import save_ply
 
-    check_packages("jinja2")
     request, fit = load_fit(folder, say=say)
     fit = scaled(fit, factor)
     note = f"The splat was scaled by {factor:.6g} after the fit, for a length of {length:g}; settings are those before."
@@ -63,15 +69,21 @@ def _scale_folder(folder: Path, out: Path, factor: float, length: float) -> None
         write_own_page(new, folder, fit, request, config=folder / "config.json", remarks=[note])
 
 
-def _scale_ply(ply: Path, out: Path, factor: float, near: "Tensor") -> None:
+def _scale_ply(ply: Path, out: Path, factor: float, near: list[float]) -> None:
     """Write a scaled PLY file; positions are read relative to a point near them, because float32 holds few digits."""
+    check_file(out, ".ply", ply)
+    load_tools()
+
+    import torch
+
     from kgs.app.files.publishing import replacing
     from kgs.fit.scale import scaled_model
     from kgs.ply import load_ply, save_ply
 
-    model = scaled_model(load_ply(ply, origin=near), factor)
+    origin = torch.tensor(near, dtype=torch.float64)
+    model = scaled_model(load_ply(ply, origin=origin), factor)
     with replacing(out.parent, "scaled") as new:
-        save_ply(new / out.name, model, offset=factor * near)
+        save_ply(new / out.name, model, offset=factor * origin)
 
 
 def _point(text: str) -> list[float]:
@@ -83,27 +95,3 @@ def _point(text: str) -> list[float]:
     if len(values) != 3 or not all(map(math.isfinite, values)):
         raise ValueError(f"by: expected a point as 1.5,-2,0.25, got {text!r}")
     return values
-
-
-def check_scale(splat: Path, by: tuple[str, str, float], out: Path, **_: Any) -> None:
-    """Check the arguments of `kgs scale`."""
-    from kgs.app.files.outputs import check_folder
-    from kgs.app.files.publishing import read_marker
-
-    from .checks import check_file, check_installed, check_results
-
-    a, b, length = by
-    if not (math.isfinite(length) and length > 0):
-        raise ValueError(f"by: expected a length above 0, got {length:g}")
-    distance = math.dist(_point(a), _point(b))
-    if not (0 < distance < math.inf and 0 < length / distance < math.inf):
-        raise ValueError(f"by: expected two points that can be {length:g} apart, got {a} and {b}")
-    if splat.is_dir():
-        check_installed("cpu", "auto", "jinja2", "safetensors")
-        check_results(splat)
-        check_folder(out, make=False)
-        if "fit" in read_marker(out):
-            raise DataError(out, "", "holds the results of kgs fit: choose another folder")
-        return
-    check_installed("cpu", "auto")
-    check_file(out, ".ply", splat)

@@ -1,0 +1,95 @@
+"""What has to be installed for a command: it is loaded here, and an error says what brings a missing package."""
+
+import sys
+import traceback
+from contextlib import suppress
+from importlib import import_module
+from importlib.util import find_spec
+from typing import TYPE_CHECKING
+
+from kgs._support.errors import printable
+
+from .interrupts import interrupt_as_usual
+
+if TYPE_CHECKING:
+    import torch
+
+_ALWAYS = ("torch", "kornia", "numpy", "cv2", "PIL")
+_EXTRAS = {
+    "numba": "fast",
+    "pi_heif": "heic",
+    "pycolmap": "sfm",
+    "distributed": "study",
+    "pandas": "study",
+    "scipy": "study",
+}
+
+
+def check_installed(*packages: str) -> None:
+    """Raise a ModuleNotFoundError if a package is not installed. Loads none."""
+    for package in packages:
+        if find_spec(package) is None:
+            raise ModuleNotFoundError(f"{package} is not installed", name=package)
+
+
+def load_tools(device: str = "cpu", backend: str = "auto", *packages: str) -> "torch.device":
+    """Load torch and the packages that a command needs, and return the device.
+
+    It takes seconds: a command calls it after all checks that need no torch. Ctrl-C ends the process at once until
+    torch is loaded, and raises KeyboardInterrupt from then on.
+
+    Raises:
+        ModuleNotFoundError: a package is not installed; nothing was loaded.
+        ImportError: a package is installed, but cannot be loaded.
+        ValueError: the device cannot be used, or the backend does not run on it.
+    """
+    check_installed(*_ALWAYS, *packages, *(["numba"] if backend == "numba" else []))
+    for package in ("torch", "kornia", "cv2"):
+        load_package(package)
+    with suppress(ImportError):  # torch does in its place
+        load_package("numba")
+    interrupt_as_usual()
+    for package in packages:
+        load_package(package)
+    from kgs._support.machine import check_device
+    from kgs.backends import resolve
+
+    found = check_device(device)
+    resolve(backend, found)
+    return found
+
+
+def load_package(package: str) -> None:
+    """Import a package; an ImportError if it fails."""
+    try:
+        import_module(package)
+    except OSError as error:  # torch loads its libraries itself
+        raise ImportError(str(error), name=package) from error
+
+
+def explain_import_error(error: ImportError) -> str:
+    """What to do about a package that is missing or broken; raises the error again where that is a mistake in kgs."""
+    if isinstance(error, ModuleNotFoundError):
+        package = (error.name or "").partition(".")[0]
+    else:
+        names = [frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__)]
+        tops = [name.partition(".")[0] for name in [error.name or "", *names]]
+        package = next((top for top in tops if top not in ("", "kgs", *sys.stdlib_module_names)), "kgs")
+    if package == "kgs":
+        raise error
+    if package == "triton":  # torch brings it
+        return str(error)
+    extra = _EXTRAS.get(package, "app")
+    if isinstance(error, ModuleNotFoundError):
+        return (
+            f'{error.name} is missing: run pip install -e ".[{extra}]" in a clone of kgs, '
+            f'or pip install "kgs-splat[{extra}]" where an index has it'
+        )
+    from importlib.metadata import packages_distributions
+
+    project = packages_distributions().get(package, [package])[0]
+    reason = printable(str(error).strip().partition("\n")[0].rstrip("."))
+    return (
+        f"{package} is installed, but cannot be loaded ({reason}): run pip install --force-reinstall {project} "
+        f"(of the extra {extra})"
+    )
