@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import product
-from math import ceil, inf, log10
+from math import ceil, inf
 from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
@@ -27,10 +27,10 @@ from kgs.datasets.synthetic import synthetic_depths, views_beyond
 from kgs.fit.run import choose_points
 from kgs.geometry import camera_centers
 from kgs.metrics.coverage import views_that_show
-from kgs.metrics.evaluate import MEASURES
+from kgs.metrics.evaluate import masked_psnr
 from kgs.metrics.lpips import Lpips
 
-from .cells import fit_and_measure, fit_config
+from .cells import fit_and_measure, fit_config, load_lpips
 from .grid import Cell
 from .presets import AUTO
 
@@ -41,7 +41,6 @@ SIZE = (189, 252)  # pixels of the synthetic views, height and width
 CAMERAS = 6  # at each of these distances
 OUTER = 0.25  # share of a real scene's photos that are held out
 _FITS = {True: {"steps": 500, "sh_degree": 0}, False: {"steps": 1000, "sh_degree": 0}}  # of synthetic and real scenes
-_lpips = lru_cache(maxsize=1)(Lpips.load)
 
 
 class Target(NamedTuple):
@@ -92,12 +91,11 @@ def beyond_cell(cell: Cell, data: str | None = None, lpips_weights: str | None =
     config = fit_config("dense", cell["seed"], cell["fit"])
     scene = _scene(cell["scene"], cell["views"], cell["downscale"], data)
     points = choose_points(scene, config)
-    lpips = None if lpips_weights is None else _lpips(lpips_weights)
+    lpips = load_lpips(lpips_weights)
     _, fit, stored = fit_and_measure(scene, config, points, lpips)
     targets = synthetic_targets(cell["scene"], scene) if cell["scene"] in WORLDS else {}
     stored["beyond"] = {str(out): measure_target(fit.render, target, lpips) for out, target in targets.items()}
-    stored |= {part: {name: fit.metrics[part][name] for name in MEASURES} for part in ("test", "train")}
-    return stored | {"init": fit.history["init"], "protocol": fit.metrics["protocol"]}
+    return stored
 
 
 def synthetic_targets(kind: str, scene: Scene) -> dict[int, Target]:
@@ -135,13 +133,14 @@ def measure_target(
     for i, shown in enumerate(target.shown):
         truth = target.views.images[i]
         image = target.views.as_photo(i, target.views.render(i, render)[0].cpu())
-        shares.append(float(shown.float().mean()))
-        if not shown.any():
+        image = torch.where(shown, image, truth)
+        share = float(shown.float().mean())
+        shares.append(share)
+        if share == 0:
             continue
-        error = float((image - truth).square().mean(dim=0)[shown].mean())
-        levels.append(-10 * log10(error) if error > 0 else inf)
+        levels.append(masked_psnr(image, truth, share))
         if lpips is not None:
-            distances.append(float(lpips(torch.where(shown, image, truth)[None], truth[None], False)))
+            distances.append(float(lpips(image[None], truth[None], False)))
     psnr = fmean(levels) if levels else inf
     return {
         "share": round(fmean(shares), 4),

@@ -1,14 +1,16 @@
 """The report of the views beyond the photos: two tables in Markdown, from any part of the cells."""
 
-import math
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from kgs.bench.output import markdown_table, mean_sd
+import pandas as pd
+
+from kgs.bench.output import mean_sd
 
 from .beyond import CAMERAS, OUT, OUTER, WORLDS
+from .pairs import frame_of, grouped
+from .texts import counts, document, table_of
 
 TITLE = "Beyond the photos"
 _NOTES = (
@@ -22,6 +24,18 @@ _NOTES = (
     f"trained on, the last {OUTER:.0%} of all photos are the outer views, all pixels. Seen: PSNR where, by the fit's "
     "own depth, two training views show the surface, and the share of these pixels.",
 )
+# What a table has of a scene: the columns of PSNR, or of a share, and of LPIPS.
+_TEST = ("test.psnr", "test.lpips_vgg_unscaled")
+_SYNTHETIC = {"inside": _TEST} | {f"{out} times out": (f"beyond.{out}.psnr", f"beyond.{out}.lpips") for out in OUT}
+_REAL = {
+    "outer views": _TEST,
+    "seen": ("seen.psnr", None),
+    "share": ("seen.share", None),
+    "training views": ("train.psnr", "train.lpips_vgg_unscaled"),
+}
+_SHARES = [f"beyond.{out}.share" for out in OUT]
+_NUMBERS = [column for columns in (*_SYNTHETIC.values(), *_REAL.values()) for column in columns if column is not None]
+_NUMBERS = [*dict.fromkeys(_NUMBERS), *_SHARES, "gaussians", "wall_seconds"]
 
 
 def write_beyond(rows: Sequence[Mapping[str, Any]], out: Path, command: str, planned: int) -> str:
@@ -33,66 +47,32 @@ def write_beyond(rows: Sequence[Mapping[str, Any]], out: Path, command: str, pla
         command: what makes this report again.
         planned: how many cells the study has when it is done.
     """
-    revisions = Counter(row["result"].get("revision") or "of no known commit" for row in rows)
-    told = "; ".join(f"{count} {revision}" for revision, count in revisions.most_common())
-    lines = [f"- Command: {command}.", f"- {len(rows)} of {planned} cells; by commit of kgs: {told}."]
-    text = "\n".join([f"# {TITLE}", "", *lines, *(f"- {note}" for note in _NOTES), "", ""])
-    synthetic = [_synthetic(*group) for group in _groups(rows) if group[0] in WORLDS]
-    real = [_real(*group) for group in _groups(rows) if group[0] not in WORLDS]
-    for title, table in (("Synthetic scenes", synthetic), ("Real scenes", real)):
-        if table:
-            text += markdown_table(title, [*table[0]][1:], [list(line.values()) for line in table], "scene")
+    frame = frame_of(rows, _NUMBERS).astype(dict.fromkeys(_NUMBERS, float))
+    commits = counts(row["result"].get("revision") or "of no known commit" for row in rows)
+    sentences = [f"Command: {command}.", f"{len(rows)} of {planned} cells; by commit of kgs: {commits}.", *_NOTES]
+    is_synthetic = frame.scene.isin(WORLDS)
+    tables = {
+        "Synthetic scenes": _table(frame[is_synthetic], _SYNTHETIC),
+        "Real scenes": _table(frame[~is_synthetic], _REAL),
+    }
+    text = document(TITLE, sentences, {title: table for title, table in tables.items() if len(table)})
     out.mkdir(parents=True, exist_ok=True)
     (out / "beyond.md").write_text(text.rstrip() + "\n", encoding="utf-8")
     return text
 
 
-def _groups(rows: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, int, str, list[Mapping[str, Any]]]]:
-    """Scene, views, method, and the results of its seeds, in order of appearance."""
-    groups: dict[tuple[str, int, str], list[Mapping[str, Any]]] = {}
-    for row in rows:
-        cell = row["cell"]
-        groups.setdefault((cell["scene"], cell["views"], cell["method"]), []).append(row["result"])
-    for key, results in groups.items():
-        yield *key, results
-
-
-def _synthetic(scene: str, views: int, method: str, results: list[Mapping[str, Any]]) -> dict[str, str]:
-    line = _start(scene, views, method, results) | {"inside": _pair(results, "test")}
-    for out in OUT:
-        some = [result["beyond"][str(out)] for result in results]
-        line[f"{out} times out"] = _of(some, "psnr", 2) + _beside(_of(some, "lpips", 3))
-    shares = (f"{results[0]['beyond'][str(out)]['share']:.2f}" for out in OUT)
-    return line | {"share": ", ".join(shares)} | _end(results)
-
-
-def _real(scene: str, views: int, method: str, results: list[Mapping[str, Any]]) -> dict[str, str]:
-    seen = [result["seen"] for result in results]
-    line = _start(scene, views, method, results)
-    line["outer views"] = _pair(results, "test")
-    line["seen"] = _of(seen, "psnr", 2)
-    line["share"] = _of(seen, "share", 2)
-    line["training views"] = _pair(results, "train")
-    return line | _end(results)
-
-
-def _start(scene: str, views: int, method: str, results: Sequence[object]) -> dict[str, str]:
-    return {"scene": f"{scene}, {views} views", "method": method, "n": str(len(results))}
-
-
-def _end(results: list[Mapping[str, Any]]) -> dict[str, str]:
-    return {"Gaussians": _of(results, "gaussians", 0), "seconds": _of(results, "wall_seconds", 0)}
-
-
-def _pair(results: list[Mapping[str, Any]], part: str) -> str:
-    """PSNR, and LPIPS if it was measured."""
-    some = [result[part] for result in results]
-    return _of(some, "psnr", 2) + _beside(_of(some, "lpips_vgg_unscaled", 3))
-
-
-def _beside(text: str) -> str:
-    return "" if text == "-" else f"; {text}"
-
-
-def _of(results: Iterable[Mapping[str, Any]], key: str, decimals: int) -> str:
-    return mean_sd((math.nan if result[key] is None else result[key] for result in results), decimals)
+def _table(frame: pd.DataFrame, heads: Mapping[str, tuple[str, str | None]]) -> pd.DataFrame:
+    """A line of text for each scene, number of views and method."""
+    lines = []
+    for (scene, views, method), cells in grouped(frame, "scene", "views", "method"):
+        line = {"scene": f"{scene}, {views} views", "method": method, "n": str(len(cells))}
+        for head, (psnr, lpips) in heads.items():
+            line[head] = mean_sd(cells[psnr], 2)
+            if lpips is not None and cells[lpips].count():
+                line[head] += f"; {mean_sd(cells[lpips], 3)}"
+        if scene in WORLDS:
+            line["share"] = ", ".join(f"{share:.2f}" for share in cells[_SHARES].iloc[0])
+        line["Gaussians"] = mean_sd(cells.gaussians, 0)
+        line["seconds"] = mean_sd(cells.wall_seconds, 0)
+        lines.append(line)
+    return table_of(lines)

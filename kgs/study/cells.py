@@ -35,7 +35,12 @@ from .running import tell_steps
 
 FULL = "full-model"  # initial points that use test views: an upper bound
 _FULL_MODEL = f"{FULL}: points seen in any two photos that are not test views, refined with test views; not allowed"
-_lpips = lru_cache(maxsize=1)(Lpips.load)
+
+
+@lru_cache(maxsize=1)
+def load_lpips(folder: str | None) -> Lpips | None:
+    """The network with the weights in this folder; None without one."""
+    return None if folder is None else Lpips.load(folder)
 
 
 def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: str | None = None) -> dict[str, Any]:
@@ -53,22 +58,18 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
     scene, points, seconds = _start(
         data, cell["scene"], cell["views"], cell["downscale"], cell["start"], cell["seed"], preset
     )
-    lpips = None if lpips_weights is None else _lpips(lpips_weights)
+    lpips = load_lpips(lpips_weights)
     settings, rival = _split(cell["fit"])
     config = fit_config(cell["start"], cell["seed"], settings)
     trainer, fit, result = fit_and_measure(scene, config, points, lpips, rival)
-    metrics = fit.metrics
     if cell["scene"] == SYNTHETIC and cell["seed"] == 0:
         result["pictures"] = _pictures(fit)
-    for part in ("test", "train"):
-        result[part] = {name: metrics[part][name] for name in MEASURES}
-    result["test_views"] = {view["name"]: view["psnr"] for view in metrics["test"]["views"]}
-    result["init"] = fit.history["init"] | {"seconds": round(seconds, 2)}
+    result["test_views"] = {view["name"]: view["psnr"] for view in fit.metrics["test"]["views"]}
+    result["init"] |= {"seconds": round(seconds, 2)}
     result["coadaptation"] = coadaptation(trainer.model, scene.test, near_plane=fit.options.near_plane)
     result["thresholds"] = count_over_threshold(trainer, points.points)
-    result["protocol"] = metrics["protocol"]
     if cell["start"] == FULL:
-        result["protocol"] = metrics["protocol"] | {"init": _FULL_MODEL}
+        result["protocol"] |= {"init": _FULL_MODEL}
     return result
 
 
@@ -91,6 +92,9 @@ def fit_and_measure(
     cpu_seconds = time.process_time() - begin
     fit = replace(fit, metrics=measure(fit, lpips))
     stored = {
+        **{part: {name: fit.metrics[part][name] for name in MEASURES} for part in ("test", "train")},
+        "init": {**fit.history["init"]},
+        "protocol": {**fit.metrics["protocol"]},
         "cpu_seconds": round(cpu_seconds, 2),
         "curve": fit.history["curve"],
         "gaussians": len(fit.model),

@@ -99,7 +99,7 @@ def study(
         cells = presets.sparse_cells(preset, data)
         path = out / "sparse.jsonl"
         do_cell = sparse_cell
-        write = guard.write_guard if preset == "guard" else partial(write_report, source=path)
+        write = guard.write_guard if preset == "guard" else write_report
         if data is not None:
             for setting in presets.too_few_photos(preset, data):
                 print(f"left out: {setting}")

@@ -10,6 +10,7 @@ from scipy import stats
 from kgs.metrics.evaluate import MEASURES
 
 from .presets import METHODS, SCENES
+from .texts import signed
 
 KEYS = ("scene", "views", "start", "method")  # equal for cells that differ only in the seed
 COLUMNS = [f"{part}.{name}" for part in ("test", "train") for name in MEASURES]
@@ -33,6 +34,7 @@ class Difference(NamedTuple):
     sd: float = math.nan
     scenes: int = 1
     over_scenes: tuple[float, float] = (math.nan, math.nan)
+    error: float = math.nan  # the standard error of the mean over scenes
 
     def text(self, decimals: int = 2, *, labels: bool = False) -> str:
         """As "+0.31 [+0.10, +0.52]"; an interval that is not known is left out, and "-" stands for no pairs.
@@ -41,16 +43,13 @@ class Difference(NamedTuple):
         """
         if not self.pairs:
             return "-"
-
-        def signed(value: float) -> str:
-            return f"{round(value, decimals) + 0.0:+.{decimals}f}"  # + 0.0: no -0.00
-
         labels = labels or self.scenes > 1
         intervals = []
         for label, (low, high) in {" over scenes": self.over_scenes, " over seeds": (self.low, self.high)}.items():
             if not math.isnan(low):
-                intervals.append(f"[{signed(low)}, {signed(high)}]{label if labels else ''}")
-        return f"{signed(self.mean)} {', '.join(intervals)}".rstrip()
+                interval = f"[{signed(low, decimals)}, {signed(high, decimals)}]"
+                intervals.append(interval + label if labels else interval)
+        return f"{signed(self.mean, decimals)} {', '.join(intervals)}".rstrip()
 
 
 class Noise(NamedTuple):
@@ -62,7 +61,7 @@ class Noise(NamedTuple):
 
     def between_means(self, n: int) -> float:
         """What two means of n seeds differ by at most, 95 times in 100, if the settings do nothing (Student's t)."""
-        return float(stats.t.ppf(0.975, self.freedom)) * math.sqrt(2 / n) * self.sd
+        return _half_interval(self.freedom, math.sqrt(2 / n) * self.sd)
 
 
 def noise_floor(groups: pd.DataFrame) -> Noise:
@@ -80,15 +79,15 @@ def paired_difference(differences: pd.DataFrame) -> Difference:
     for these scenes. Over scenes they are taken as drawn from all of their kind: Student's t over the scenes' means,
     k - 1 degrees of freedom for k scenes; none for a single one.
     """
-    counts = differences.count()[differences.count() > 0]  # pairs of each scene
-    k = len(counts)
-    means = differences.mean().dropna()
+    differences = differences.dropna(axis="columns", how="all")
+    counts = differences.count()  # pairs of each scene
+    means = differences.mean()
+    k = len(means)
     mean = float(means.mean())
+    error = float(means.sem())
     noise = noise_floor(differences)
-    error_by_seeds = noise.sd * math.sqrt((1 / counts).sum()) / max(1, k)
-    error_by_scenes = float(means.std()) / math.sqrt(max(1, k))
-    by_seeds = stats.t.ppf(0.975, noise.freedom) * error_by_seeds
-    by_scenes = stats.t.ppf(0.975, k - 1) * error_by_scenes
+    by_seeds = _half_interval(noise.freedom, noise.sd * math.sqrt((1 / counts).sum()) / max(1, k))
+    by_scenes = _half_interval(k - 1, error)
     return Difference(
         pairs=int(counts.sum()),
         mean=mean,
@@ -97,25 +96,37 @@ def paired_difference(differences: pd.DataFrame) -> Difference:
         sd=noise.sd,
         scenes=k,
         over_scenes=(mean - by_scenes, mean + by_scenes),
+        error=error,
     )
+
+
+def _half_interval(freedom: int, error: float) -> float:
+    """Half of the 95 % interval of Student's t; NaN without a degree of freedom."""
+    return float(stats.t.ppf(0.975, freedom)) * error
+
+
+def frame_of(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> pd.DataFrame:
+    """One line per row: the fields of its cell, and these of its result, as "test.psnr"; NaN where it has none."""
+    results = pd.json_normalize([row["result"] for row in rows]).reindex(columns=[*columns])
+    return pd.DataFrame([row["cell"] for row in rows]).join(results)
 
 
 def cells_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """One line per cell, by scene; ValueError: no rows, or two that differ in the fit's settings or size alone."""
     if not rows:
         raise ValueError("rows: expected at least one cell, got none")
-    cells = pd.DataFrame([row["cell"] for row in rows])[[*KEYS, "seed", "fit"]]
-    results = pd.json_normalize([row["result"] for row in rows]).reindex(columns=COLUMNS + _OTHERS)
-    results[COLUMNS] = results[COLUMNS].astype(float).where(lambda numbers: numbers.abs() < math.inf)
-    twice = cells.loc[cells.duplicated([*KEYS, "seed"]), [*KEYS, "seed"]].to_numpy()
+    frame = frame_of(rows, COLUMNS + _OTHERS)
+    frame[COLUMNS] = frame[COLUMNS].astype(float).where(lambda numbers: numbers.abs() < math.inf)
+    twice = frame.loc[frame.duplicated([*KEYS, "seed"]), [*KEYS, "seed"]].to_numpy()
     if len(twice):
         *group, seed = twice[0]
         raise ValueError(f"rows: expected one cell for each seed of {tuple(group)}, got two for {seed}")
-    order = {name: k for k, name in enumerate([*cells.scene.unique(), *STARTS, *METHODS])}
-    ranks = cells[[*KEYS]].copy()
-    for key in ("scene", "start", "method"):
-        ranks[key] = cells[key].map(order).fillna(len(order))
-    return cells.join(results).iloc[ranks.sort_values([*KEYS], kind="stable").index]
+    order = {name: k for k, name in enumerate([*frame.scene.unique(), *STARTS, *METHODS])}
+
+    def rank(column: "pd.Series[Any]") -> "pd.Series[Any]":
+        return column if column.name == "views" else column.map(order).fillna(len(order))
+
+    return frame.sort_values([*KEYS], key=rank)
 
 
 def grouped(frame: pd.DataFrame, *keys: str) -> Iterable[tuple[Any, pd.DataFrame]]:

@@ -10,15 +10,16 @@ from .findings import headline, regret
 from .pairs import KEYS, LPIPS, PSNR, difference, grouped, main_cells, noise_floor, wide
 from .presets import AUTO, AUTO_OFF, FAMILIES, MAIN, OFF, PAPER
 from .published import benchmark_of, priors, published, published_difference
+from .texts import table_of
 
 QUALITY = {PSNR: "PSNR [dB]", "test.ssim_zero_padded": "SSIM", LPIPS: "LPIPS"}
-_COST = {
-    "PSNR, training less test views [dB]": "gap",
-    "wall clock [s]": "wall_seconds",
-    "CPU [s]": "cpu_seconds",
-    "Gaussians": "gaussians",
-    "peak memory [MiB]": "peak_rss_mb",
-    "co-adaptation [1e-3]": "thousandths",
+_COST = {  # a column, and its decimals
+    "PSNR, training less test views [dB]": ("gap", 2),
+    "wall clock [s]": ("wall_seconds", 0),
+    "CPU [s]": ("cpu_seconds", 0),
+    "Gaussians": ("gaussians", 0),
+    "peak memory [MiB]": ("peak_rss_mb", 0),
+    "co-adaptation [1e-3]": ("thousandths", 2),
 }
 _HEADLINE = "Paired differences of the means over scenes; those of one scene have their interval over seeds"
 _TITLE = """Test views: mean (sd) over n seeds; paired differences over off with their 95 % intervals; the paper's \
@@ -53,8 +54,7 @@ def sparse_tables(frame: pd.DataFrame) -> dict[str, pd.DataFrame]:
     tables[_NOISE] = _noise(frame)
     tables["Cost, overfitting and co-adaptation: mean (sd) over n seeds"] = _costs(main)
     tables["Scenes, splits and settings"] = _protocol(frame)
-    whole = {title: pd.DataFrame(lines).fillna("-") for title, lines in tables.items() if lines}
-    return {title: table.loc[:, (table != "-").any()] for title, table in whole.items()}
+    return {title: table_of(lines) for title, lines in tables.items() if lines}
 
 
 def _by_views(dense: pd.DataFrame) -> Lines:
@@ -72,9 +72,7 @@ def _costs(main: pd.DataFrame) -> Lines:
     lines = []
     for (*_, method), cells in grouped(main, *KEYS):
         line = {"scene": _setting(cells), "method": method, "n": str(len(cells))}
-        for head, key in _COST.items():
-            line[head] = mean_sd(cells[key], 2 if key in ("gap", "thousandths") else 0)
-        lines.append(line)
+        lines.append(line | {head: mean_sd(cells[key], decimals) for head, (key, decimals) in _COST.items()})
     return lines
 
 
@@ -147,17 +145,13 @@ def _compared(cells: pd.DataFrame, methods: Iterable[str], mean: str = "", bases
 
 
 def _degrees(frame: pd.DataFrame) -> Lines:
-    decided = frame[frame["decisions.sh_degree.chosen"].notna()].sort_values("seed", kind="stable")
-    decided = decided.rename(columns=lambda name: name.removeprefix("decisions.sh_degree."))
-    heads = {
-        "chosen": ("chosen", "{:.0f}"),
-        "possible gain of degree 3 [dB]": ("gain", "{:+.2f}"),
-    }
+    decided = frame.rename(columns=lambda name: name.removeprefix("decisions.sh_degree."))
+    decided = decided[decided.chosen.notna()].sort_values("seed", kind="stable")
     lines = []
     for (scene, views, method), cells in grouped(decided, *KEYS[:2], "method"):
         line = {"scene": f"{scene}, {views} views", "method": method, "by": ", ".join(cells.by.unique())}
-        for head, (key, text) in heads.items():
-            line[head] = ", ".join(text.format(number) for number in cells[key].dropna()) or "-"
+        line["chosen"] = ", ".join(f"{degree:.0f}" for degree in cells.chosen)
+        line["possible gain of degree 3 [dB]"] = ", ".join(f"{gain:+.2f}" for gain in cells.gain.dropna()) or "-"
         lines.append(line)
     return lines
 
@@ -183,21 +177,16 @@ def _starts(frame: pd.DataFrame) -> Lines:
 
 
 def _noise(frame: pd.DataFrame) -> Lines:
-    parts = [(scene, PSNR, cells) for (scene,), cells in grouped(frame, "scene")]
-    if len(parts) < 2:
-        parts = []
+    by_scene = [(scene, PSNR, cells) for (scene,), cells in grouped(frame, "scene")]
+    parts = by_scene if len(by_scene) > 1 else []
     parts += [("all cells", measure, frame) for measure in QUALITY]
     lines = []
     for name, measure, cells in parts:
         noise = noise_floor(wide(cells, measure))
         if not noise.freedom:
             continue
-        line = {
-            "scene": name,
-            "measure": QUALITY[measure],
-            "groups": str(noise.groups),
-            "degrees of freedom": str(noise.freedom),
-        }
+        line = {"scene": name, "measure": QUALITY[measure]}
+        line |= {"groups": str(noise.groups), "degrees of freedom": str(noise.freedom)}
         numbers = {
             "sd between seeds": noise.sd,
             "two single runs": noise.between_means(1),

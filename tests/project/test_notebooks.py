@@ -92,7 +92,7 @@ CLAIMS = {
         }
         assert len(starts["dense"].points) == POINTS and starts["dense"].kind == "dense"
         assert all(low < mean < high for _, mean, low, high, *_ in intervals)
-        assert "llff/fern, 3 views" in differences("off")
+        assert "llff/fern, 3 views" in differences("progressive 0.2", "off")
         """,
         """
         assert error.median() < 0.05

@@ -67,6 +67,12 @@ def noise(scene):
     return math.sqrt(2) * np.std(OF_SEEDS[scene], ddof=1)
 
 
+def keep(stored, wanted):
+    """Leave in the file only the lines of some cells."""
+    lines = [line for line in stored.read_text().splitlines() if wanted(json.loads(line)["cell"])]
+    stored.write_text("\n".join(lines) + "\n")
+
+
 # -- the cells ----------------------------------------------------------------------------------------------------
 
 
@@ -121,17 +127,32 @@ def test_the_mean_has_the_noise_of_its_scenes_and_a_standard_error(rows_of, stor
     assert "mean of 1 scenes" not in write_guard(new[:1], tmp_path / "one", "COMMAND", 40, stored)
 
 
-@pytest.mark.parametrize(("noises", "marked"), [(1.9, False), (2.1, True), (-1.9, False), (-2.1, True)])
-def test_what_is_beyond_two_noises_is_marked(noises, marked, rows_of, stored, tmp_path):
-    new = rows_of(scenes=(FERN,), change=noises * noise(FERN))
-    text = write_guard(new, tmp_path / "new", "COMMAND", 40, stored)
-    assert table(text)[FERN]["change of PSNR [dB]"].endswith(" !") == marked
-    assert f"{int(marked)} of 4 changes of single scenes are beyond noise" in text
+@pytest.mark.parametrize(
+    ("noises", "mark", "sentence"),
+    [
+        (1.9, "", "0 of 4 changes of single scenes are beyond noise"),
+        (2.1, " !", "1 of 4 changes of single scenes are beyond noise"),
+        (-1.9, "", "No mean has changed beyond noise"),
+        (-2.1, " !", "Beyond noise in the mean: auto: PSNR [dB] -"),
+    ],
+)
+def test_what_is_beyond_two_noises_is_marked(noises, mark, sentence, rows_of, stored, tmp_path):
+    change = noises * noise(FERN)
+    text = write_guard(rows_of(scenes=(FERN,), change=change), tmp_path / "new", "COMMAND", 40, stored)
+    assert table(text)[FERN]["change of PSNR [dB]"] == f"{change:+.2f} ({noise(FERN):.2f}){mark}"
+    assert sentence in text
 
 
-def test_the_report_begins_with_the_means_that_are_beyond_noise(rows_of, stored, tmp_path):
-    text = write_guard(rows_of(change=-1.5), tmp_path / "new", "COMMAND", 40, stored)
-    assert "Beyond noise in the mean: auto: PSNR [dB] -1.50 (" in text
+@pytest.mark.parametrize(
+    ("seeds", "stored_seeds", "noises"),
+    [((0, 1, 2), (0, 1, 2), f" ({noise(FERN) / math.sqrt(3):.2f})"), ((0,), (0,), "")],
+    ids=["more seeds have less noise", "one stored seed tells none"],
+)
+def test_the_noise_is_told_by_seeds(seeds, stored_seeds, noises, rows_of, stored, tmp_path):
+    keep(stored, lambda cell: cell["seed"] in stored_seeds)
+    text = write_guard(rows_of(seeds=seeds, change=0.1), tmp_path / "new", "COMMAND", 40, stored)
+    assert table(text)[FERN]["change of PSNR [dB]"] == f"+0.10{noises}"
+    assert ("nothing stored to tell a change from noise by" in text) == (not noises)
 
 
 def test_unchanged_fits_have_no_change_and_no_mark(rows_of, stored, tmp_path):
@@ -143,11 +164,6 @@ def test_unchanged_fits_have_no_change_and_no_mark(rows_of, stored, tmp_path):
     assert (tmp_path / "new" / "guard.jsonl").read_bytes() == stored.read_bytes()
 
 
-def test_more_seeds_have_less_noise(rows_of, stored, tmp_path):
-    text = write_guard(rows_of(seeds=(0, 1, 2), change=0.1), tmp_path / "new", "COMMAND", 40, stored)
-    assert table(text)[FERN]["change of PSNR [dB]"] == f"+0.10 ({noise(FERN) / math.sqrt(3):.2f})"
-
-
 def test_without_stored_cells_there_are_values_alone(rows_of, tmp_path):
     text = write_guard(rows_of(), tmp_path / "new", "COMMAND", 40, tmp_path / "none.jsonl")
     assert list(table(text)[FERN]) == ["scene", "PSNR [dB]", "LPIPS", "seconds", "Gaussians"]
@@ -156,21 +172,12 @@ def test_without_stored_cells_there_are_values_alone(rows_of, tmp_path):
 
 
 def test_a_stored_cell_that_is_missing_leaves_its_scene_out_of_the_mean_change(rows_of, stored, tmp_path):
-    kept = [line for line in stored.read_text().splitlines() if json.loads(line)["cell"]["scene"] == "llff/fern"]
-    stored.write_text("\n".join(kept) + "\n")
+    keep(stored, lambda cell: cell["scene"] == "llff/fern")
     found = table(write_guard(rows_of(change=0.3), tmp_path / "new", "COMMAND", 40, stored))
     assert found[FLOWER]["change of PSNR [dB]"] == "-"
     assert found[FLOWER]["PSNR [dB]"] == "22.30"
     assert found["mean of 2 scenes"]["change of PSNR [dB]"] == f"+0.30 ({noise(FERN):.2f})"
     assert found["standard error"]["change of PSNR [dB]"] == "-"
-
-
-def test_a_stored_default_of_one_seed_tells_changes_without_noise(rows_of, stored, tmp_path):
-    kept = [line for line in stored.read_text().splitlines() if json.loads(line)["cell"]["seed"] == 0]
-    stored.write_text("\n".join(kept) + "\n")
-    text = write_guard(rows_of(change=3.0), tmp_path / "new", "COMMAND", 40, stored)
-    assert table(text)[FERN]["change of PSNR [dB]"] == "+3.00"
-    assert "nothing stored to tell a change from noise by" in text
 
 
 def test_fits_of_other_settings_are_not_compared(rows_of, stored, tmp_path):

@@ -13,6 +13,7 @@ from kgs.study.findings import findings, headline, regret
 from kgs.study.pairs import Difference, Noise, cells_frame, difference, main_cells, noise_floor, paired_difference, wide
 from kgs.study.published import PUBLISHED, benchmark_of, priors, published, published_difference
 from kgs.study.tables import BEST_OF_5, sparse_tables
+from kgs.study.texts import counts, document, table_of
 
 PAPER = "progressive 0.2"
 
@@ -35,48 +36,46 @@ def test_mean_and_deviation_as_text():
     assert [mean_sd(values, 1) for values in ([2.0], [math.nan], [])] == ["2.0", "-", "-"]
 
 
-def test_interval_of_one_scene_is_that_of_a_paired_t_test():
-    differences = [0.31, -0.12, 0.44, 0.20, 0.05]
-    found = paired_difference(columns(differences))
-    half = student(4) * np.std(differences, ddof=1) / math.sqrt(5)
-    assert found.pairs == 5
-    assert (found.mean, found.low, found.high) == pytest.approx((0.176, 0.176 - half, 0.176 + half))
+ONE = [0.31, -0.12, 0.44, 0.20, 0.05]
+NONE = math.nan
 
 
-def test_one_pair_has_no_interval_and_none_no_difference():
-    assert paired_difference(columns([0.5]))[:2] == (1, 0.5)
-    found = paired_difference(columns([0.5], [], [0.1]))
-    assert found[:2] == (2, pytest.approx(0.3))
-    assert math.isnan(found.low)
-    assert paired_difference(columns([], [])).pairs == paired_difference(pd.DataFrame()).pairs == 0
-
-
-def test_scenes_weigh_alike_and_share_their_variance():
-    found = paired_difference(columns([1.0, 3.0], [10.0, 10.0, 10.0, 10.0], [4.0]))
-    # variance between seeds (2 + 0) / (1 + 3); of the mean over scenes a ninth of 1/2 + 1/4 + 1/1 times that
-    half = student(4) * math.sqrt(0.5 * 1.75 / 9)
-    assert found.pairs == 7
-    assert (found.mean, found.low, found.high) == pytest.approx((16 / 3, 16 / 3 - half, 16 / 3 + half))
-
-
-def test_the_interval_over_scenes_is_that_of_a_t_test_on_their_means():
-    groups = ([1.0, 3.0], [10.0, 10.0, 10.0, 10.0], [4.0], [])
+@pytest.mark.parametrize(
+    ("groups", "pairs", "mean", "over_seeds", "over_scenes"),  # half of the intervals
+    [
+        ([ONE], 5, 0.176, student(4) * np.std(ONE, ddof=1) / math.sqrt(5), NONE),
+        ([ONE[:3], []], 3, 0.21, student(2) * np.std(ONE[:3], ddof=1) / math.sqrt(3), NONE),
+        ([[0.5]], 1, 0.5, NONE, NONE),
+        ([[0.5], [], [0.1]], 2, 0.3, NONE, 0.2 * student(1)),
+        # variance between seeds (2 + 0) / (1 + 3); of the mean over scenes a ninth of 1/2 + 1/4 + 1/1 times that
+        (
+            [[1.0, 3.0], [10.0, 10.0, 10.0, 10.0], [4.0], []],
+            7,
+            16 / 3,
+            student(4) * math.sqrt(0.5 * 1.75 / 9),
+            student(2) * np.std([2.0, 10.0, 4.0], ddof=1) / math.sqrt(3),
+        ),
+        # two scenes: Cauchy's quantile, and half of their distance
+        ([[0.0, 0.2], [0.3]], 3, 0.2, student(1) * math.sqrt(0.02 * 1.5 / 4), 0.1 * math.tan(math.pi / 2 * 0.95)),
+    ],
+    ids=["a paired t-test", "a scene without pairs", "one pair", "no seeds", "scenes weigh alike", "two scenes"],
+)
+def test_a_paired_difference_has_the_intervals_of_two_t_tests(groups, pairs, mean, over_seeds, over_scenes):
     found = paired_difference(columns(*groups))
-    means = [2.0, 10.0, 4.0]
-    half = student(2) * np.std(means, ddof=1) / math.sqrt(3)
-    assert found.scenes == 3
-    assert found.over_scenes == pytest.approx((16 / 3 - half, 16 / 3 + half))
-    # two scenes: Cauchy's quantile, and half of their distance
-    found = paired_difference(columns([0.0, 0.2], [0.3]))
-    assert found.over_scenes == pytest.approx([0.2 + sign * 0.1 * math.tan(math.pi / 2 * 0.95) for sign in (-1, 1)])
+    scenes = sum(map(bool, groups))
+    assert (found.pairs, found.scenes, found.mean) == (pairs, scenes, pytest.approx(mean))
+    expected = (mean - over_seeds, mean + over_seeds, mean - over_scenes, mean + over_scenes)
+    assert (found.low, found.high, *found.over_scenes) == pytest.approx(expected, nan_ok=True)
+    error = over_scenes / student(scenes - 1) if scenes > 1 else NONE
+    assert found.error == pytest.approx(error, nan_ok=True)
+    assert ("over scenes" in found.text(labels=True)) == (scenes > 1)
 
 
-def test_a_single_scene_has_no_interval_over_scenes():
-    found = paired_difference(columns([0.31, -0.12, 0.44], []))
-    assert found.scenes == 1
-    assert np.isnan(found.over_scenes).all()
-    assert "over scenes" not in found.text(labels=True)
-    assert math.isfinite(found.low)
+def test_without_pairs_there_is_no_difference():
+    for nothing in (columns([], []), pd.DataFrame()):
+        found = paired_difference(nothing)
+        assert (found.pairs, found.scenes, found.text()) == (0, 0, "-")
+        assert math.isnan(found.mean)
 
 
 @pytest.mark.slow
@@ -111,6 +110,14 @@ def test_differences_as_text():
     assert several.text(1) == "+0.3 [-1.0, +1.6] over scenes, [+0.2, +0.4] over seeds"
     assert several._replace(low=math.nan).text(1) == "+0.3 [-1.0, +1.6] over scenes"
     assert Difference(3, 0.3, 0.2, 0.4).text(1, labels=True) == "+0.3 [+0.2, +0.4] over seeds"
+
+
+def test_tables_and_counts_as_text():
+    table = table_of([{"a": "1", "b": "-"}, {"a": "2", "c": "3"}])
+    assert document("T", ["s"], {"t": table}) == (
+        "# T\n\n- s\n\nt:\n\n| a | c |\n| --- | --- |\n| 1 | - |\n| 2 | 3 |\n\n"
+    )
+    assert counts("cabbb") == "3 b; 1 c; 1 a"
 
 
 def test_noise_floor():

@@ -1,4 +1,4 @@
-"""Times commands of two installations of kgs in turn: `python measure.py BEFORE AFTER SCENE PHOTOS`.
+"""Times commands of two installations of kgs in turn: `python commands.py BEFORE AFTER SCENE PHOTOS`.
 
 BEFORE and AFTER are the `kgs` programs of two virtual environments, SCENE is LLFF fern, PHOTOS a folder of six unposed
 photos. Run each command once before, so that kernels are compiled. Prints for each command all wall times in seconds,
