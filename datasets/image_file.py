@@ -1,8 +1,7 @@
 """An image on disk, read by Pillow: opened once, decoded once, its colours converted to sRGB.
 
-Two kinds of pixels are decoded by others. Those of a JPEG by libjpeg-turbo (kornia_rs): both give the same bits, but
-Pillow is silent about damaged ones, whose colours are wrong. And 16-bit integers by OpenCV, because Pillow cuts them to
-8 bits.
+OpenCV decodes integers of 16 bits, which Pillow cuts to 8, and Kornia JPEGs: Pillow gives the same bits, but takes
+damaged ones, too, whose colours are wrong.
 """
 
 import contextlib
@@ -18,6 +17,7 @@ import numpy as np
 from kornia_rs import io as kornia_io
 from numpy.typing import NDArray
 from PIL import BmpImagePlugin, JpegImagePlugin, PngImagePlugin, TiffImagePlugin, WebPImagePlugin
+from PIL.ExifTags import IFD, Base
 from PIL.Image import Exif
 from PIL.ImageFile import ImageFile as Opened
 
@@ -27,49 +27,29 @@ from . import folders
 from .color_profile import ADOBE_RGB, Colors, Profile, cmyk_to_rgb, colors_of, is_usable, to_srgb
 
 Image = NDArray[np.float32]
-_PLUGINS: dict[str, type[Opened]] = {
-    "PNG": PngImagePlugin.PngImageFile,
-    "JPEG": JpegImagePlugin.JpegImageFile,
-    "WebP": WebPImagePlugin.WebPImageFile,
-    "BMP": BmpImagePlugin.BmpImageFile,
-    "TIFF": TiffImagePlugin.TiffImageFile,
-}
-_KINDS = {
-    b"\x89PNG\r\n\x1a\n": "PNG",
-    b"\xff\xd8": "JPEG",
-    b"RIFF": "WebP",
-    b"BM": "BMP",
-    b"II*\0": "TIFF",
-    b"MM\0*": "TIFF",
+_PLUGINS: dict[bytes, type[Opened]] = {
+    b"\x89PNG\r\n\x1a\n": PngImagePlugin.PngImageFile,
+    b"\xff\xd8": JpegImagePlugin.JpegImageFile,
+    b"RIFF": WebPImagePlugin.WebPImageFile,
+    b"BM": BmpImagePlugin.BmpImageFile,
+    b"II*\0": TiffImagePlugin.TiffImageFile,
+    b"MM\0*": TiffImagePlugin.TiffImageFile,
 }
 _HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
-_LONGEST_SIGNATURE = 12  # bytes
+_MAX_SIGNATURE = 12  # bytes
 _PNG_BITS = 24  # the byte of a PNG that has the bits of a sample
 _LISTED = 10
 _TO_RGB = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}
-# Tags of TIFF and Exif
-_BITS = 258
-_COLORS = 262
-_ORIENTATION = 274
-_SAMPLES = 277
-_TILE_WIDTH = 322
-_TILE_HEIGHT = 323
-_EXTRA_SAMPLES = 338
-_WHITE = 318
-_PRIMARIES = 319
-_EXIF = 34665
-_COLOR_SPACE = 40961
-_INTEROPERABILITY = 40965
-_GAMMA = 42240
-_LAB = {8: "CIELab", 9: "ICCLab", 10: "ITULab"}  # values of `_COLORS` that are decoded wrongly
-_MULTIPLIED_ALPHA = 1  # a value of `_EXTRA_SAMPLES`
-_ALPHA = 2  # likewise
-_WHITE_IS_ZERO = 0  # a value of `_COLORS`
+# Values of tags of TIFF and Exif
+_LAB = {8: "CIELab", 9: "ICCLab", 10: "ITULab"}  # of `Base.PhotometricInterpretation`: decoded wrongly
+_WHITE_IS_ZERO = 0  # of `Base.PhotometricInterpretation`
 _CMYK = 5  # likewise
-_UNSPECIFIED = (2, 2)  # primaries and curve in nclx
-_IS_SRGB = 1  # a value of `_COLOR_SPACE`
+_MULTIPLIED_ALPHA = 1  # of `Base.ExtraSamples`
+_ALPHA = 2  # likewise
+_IS_SRGB = 1  # of `Base.ColorSpace`
 _IS_ADOBE_RGB = 2  # likewise, of some cameras
 _IS_OTHER = 65535  # likewise
+_UNSPECIFIED = (2, 2)  # primaries and curve in nclx
 
 
 class Metadata(NamedTuple):
@@ -111,10 +91,12 @@ class ImageFile:
     def metadata(self) -> Metadata:
         """Size, tags and colour profile, from the header."""
         if self._metadata is None:
-            if self._data is None:
-                self._metadata = _read_header_of_file(self.path)
-            else:
-                self._metadata = _read_header(self.path, io.BytesIO(self._data), len(self._data))
+            try:
+                file: IO[bytes] = self.path.open("rb") if self._data is None else io.BytesIO(self._data)
+                with file:
+                    self._metadata = _read_header(self.path, file)
+            except OSError as error:
+                raise DataError(self.path, "", f"cannot be read ({error.strerror})") from error
         return self._metadata
 
     def read(self) -> Image:
@@ -123,10 +105,9 @@ class ImageFile:
         Values are sRGB in [0, 1], not multiplied by alpha. The file's bytes are not kept.
         """
         data = self.load()
-        kind = _kind(self.path, data[:_LONGEST_SIGNATURE])
         metadata = self.metadata  # the size is checked before anything is decoded
         try:
-            pixels = _decode(kind, data)
+            pixels = _decode(_plugin(self.path, data[:_MAX_SIGNATURE]), data)
         except ValueError as error:
             raise DataError(self.path, "", str(error)) from error
         height, width = pixels.shape[:2]
@@ -140,7 +121,7 @@ class ImageFile:
         """Why its colours may be others than sRGB, which they are taken for; "" where all is well."""
         if not is_usable(self.metadata.profile):
             return "the colour profile is damaged or of another kind"
-        if not self.metadata.profile and self.metadata.tags.get(_COLOR_SPACE) == _IS_OTHER:
+        if not self.metadata.profile and self.metadata.tags.get(Base.ColorSpace) == _IS_OTHER:
             return "the Exif says that they are not, and not what they are"
         return ""
 
@@ -177,69 +158,54 @@ def is_heic(data: bytes) -> bool:
     return data[4:8] == b"ftyp" and data[8:12] in _HEIC_BRANDS
 
 
-def _kind(path: Path, head: bytes) -> str:
-    """The format of a file that begins with these bytes; a DataError about `path` where it cannot be read."""
+def _plugin(path: Path, head: bytes) -> type[Opened]:
+    """What reads a file that begins with these bytes; a DataError about `path` where nothing does.
+
+    `PIL.Image.open` is not used: its bound on pixels does not depend on the number of bytes in the file.
+    """
     if not head:
         raise DataError(path, "", "expected an image, got an empty file")
     if is_heic(head) and folders.has_heic():
-        return "HEIC"
-    for signature, kind in _KINDS.items():
+        import pi_heif
+
+        plugin: type[Opened] = pi_heif.HeifImageFile
+        return plugin
+    for signature, plugin in _PLUGINS.items():
         if head.startswith(signature):
-            return kind
+            return plugin
     raise DataError(path, "", "cannot be decoded: expected a PNG, JPEG, WebP, BMP or TIFF image")
 
 
-def _read_header_of_file(path: Path) -> Metadata:
-    try:
-        with path.open("rb") as file:
-            length = file.seek(0, io.SEEK_END)
-            file.seek(0)
-            return _read_header(path, file, length)
-    except OSError as error:
-        raise DataError(path, "", f"cannot be read ({error.strerror})") from error
-
-
-def _read_header(path: Path, file: IO[bytes], length: int) -> Metadata:
-    """Size, tags and colour profile of an image file of `length` bytes."""
-    kind = _kind(path, file.read(_LONGEST_SIGNATURE))
+def _read_header(path: Path, file: IO[bytes]) -> Metadata:
+    """Size, tags and colour profile of an image file."""
+    plugin = _plugin(path, file.read(_MAX_SIGNATURE))
+    length = file.seek(0, io.SEEK_END)
     file.seek(0)
     try:
         with warnings.catch_warnings(action="ignore"):  # Pillow warns of damaged metadata
-            image = _open(kind, file)
-            chunks = _png_chunks(file) if kind == "PNG" else {}
+            image = plugin(file)
+            chunks = _png_chunks(file) if image.format == "PNG" else {}
             image.info |= {"exif": chunks[b"eXIf"]} if b"eXIf" in chunks else {}
             tags = _tags(image)
-        if kind == "HEIC":
-            tags[_ORIENTATION] = _left_to_turn(image, file)
+        if image.format == "HEIF":
+            tags[Base.Orientation] = _left_to_turn(image, file)
         size = (image.width, image.height)
         tile = (1, 1)
-        if kind == "TIFF":
-            if int(tags.get(_ORIENTATION, 1)) in (5, 6, 7, 8):
+        if image.format == "TIFF":
+            if int(tags.get(Base.Orientation, 1)) in (5, 6, 7, 8):
                 size = size[::-1]  # Pillow gives that of the upright image
             tiff = image.tag_v2  # type: ignore[attr-defined]  # of TIFF only
-            tile = int(tiff.get(_TILE_WIDTH, 1)), int(tiff.get(_TILE_HEIGHT, 1))
+            tile = int(tiff.get(Base.TileWidth, 1)), int(tiff.get(Base.TileLength, 1))
     except Exception as error:  # damaged bytes raise whatever Pillow's plugins happen to raise
-        raise DataError(path, "", f"cannot be decoded: damaged, cut short, or an unusual {kind} ({error})") from error
+        reason = f"cannot be decoded: damaged, cut short, or an unusual {plugin.format} ({error})"
+        raise DataError(path, "", reason) from error
     check_size(path, *size, length)
     check_size(path, *tile, length)  # tiles are decoded whole
     try:
-        profile = _profile(kind, image, file, chunks, tags)
+        profile = _profile(image, file, chunks, tags)
     except ValueError as error:
         raise DataError(path, "", str(error)) from error
     return Metadata(size, tags, profile)
-
-
-def _open(kind: str, file: IO[bytes]) -> Opened:
-    """An image whose header Pillow has read.
-
-    Not by `PIL.Image.open`, because its bound on pixels does not depend on the number of bytes in the file.
-    """
-    if kind == "HEIC":
-        import pi_heif
-
-        opened: Opened = pi_heif.HeifImageFile(file)
-        return opened
-    return _PLUGINS[kind](file)
 
 
 def _tags(image: Opened) -> dict[int, Any]:
@@ -252,9 +218,9 @@ def _tags(image: Opened) -> dict[int, Any]:
             exif = image.getexif()
         else:
             return {}
-        tags = dict(exif) | exif.get_ifd(_EXIF)
+        tags = dict(exif) | exif.get_ifd(IFD.Exif)
         with contextlib.suppress(Exception):
-            tags[_INTEROPERABILITY] = exif.get_ifd(_INTEROPERABILITY).get(1)
+            tags[IFD.Interop] = exif.get_ifd(IFD.Interop).get(1)
         return tags
     except Exception:  # Pillow has no error of its own for damage
         return {}
@@ -273,34 +239,34 @@ def _png_chunks(file: IO[bytes]) -> dict[bytes, bytes]:
     return found
 
 
-def _profile(kind: str, image: Opened, file: IO[bytes], chunks: dict[bytes, bytes], tags: dict[int, Any]) -> Profile:
+def _profile(image: Opened, file: IO[bytes], chunks: dict[bytes, bytes], tags: dict[int, Any]) -> Profile:
     """What a file says of its colours, what counts more first; a ValueError where they cannot be converted."""
-    icc: bytes = image.info.get("icc_profile") or (_bmp_profile(file) if kind == "BMP" else b"")
-    if kind == "PNG" and len(cicp := chunks.get(b"cICP", b"")) == 4:
+    icc: bytes = image.info.get("icc_profile") or (_bmp_profile(file) if image.format == "BMP" else b"")
+    if image.format == "PNG" and len(cicp := chunks.get(b"cICP", b"")) == 4:
         primaries, curve, matrix, full = cicp
         if (matrix, full) != (0, 1):
             raise ValueError(f"expected RGB of the full range, got matrix {matrix} and range {full} in its cICP chunk")
         return colors_of(primaries, curve)
     if icc:
         return icc
-    if kind == "PNG" and "srgb" in image.info:
+    if image.format == "PNG" and "srgb" in image.info:
         return Colors()
-    if kind == "PNG" and ("gamma" in image.info or "chromaticity" in image.info):
+    if image.format == "PNG" and ("gamma" in image.info or "chromaticity" in image.info):
         chromaticities = image.info.get("chromaticity") or (*Colors().white, *sum(Colors().primaries, ()))
         exponent = image.info.get("gamma")
         return Colors.of(chromaticities[:2], chromaticities[2:], 1 / exponent if exponent else None) or b""
     nclx = image.info.get("nclx_profile")
     if nclx and (nclx["color_primaries"], nclx["transfer_characteristics"]) != _UNSPECIFIED:
         return colors_of(nclx["color_primaries"], nclx["transfer_characteristics"])
-    space = tags.get(_COLOR_SPACE)
+    space = tags.get(Base.ColorSpace)
     if space == _IS_SRGB:
         return Colors()
-    index = tags.get(_INTEROPERABILITY)
+    index = tags.get(IFD.Interop)
     index = index.decode("latin-1") if isinstance(index, bytes) else str(index)
     if space == _IS_ADOBE_RGB or index.startswith("R03"):
         return ADOBE_RGB
-    if _WHITE in tags and _PRIMARIES in tags:
-        return Colors.of(tags[_WHITE], tags[_PRIMARIES], tags.get(_GAMMA)) or b""
+    if Base.WhitePoint in tags and Base.PrimaryChromaticities in tags:
+        return Colors.of(tags[Base.WhitePoint], tags[Base.PrimaryChromaticities], tags.get(Base.Gamma)) or b""
     return b""
 
 
@@ -338,29 +304,22 @@ def check_size(path: Path, width: int, height: int, size: int) -> None:
         raise DataError(path, "header", f"claims {width}x{height} pixels in {size} bytes: a decompression bomb")
 
 
-def _decode(kind: str, data: bytes) -> Image:
+def _decode(plugin: type[Opened], data: bytes) -> Image:
     """RGB or RGBA in [0, 1] of an image's bytes, whose size was checked; a ValueError where it cannot be decoded."""
     try:
-        if kind == "JPEG":
-            return _to_float(_decode_jpeg(data))
-        if kind == "TIFF":
-            return _decode_tiff(data)
-        image = _open(kind, io.BytesIO(data))
-        if kind == "PNG":
-            _open(kind, io.BytesIO(data)).verify()  # the check sums, which decoders pass over
-            clear = image.info.get("transparency")
-            is_one_grey = isinstance(clear, int) and image.mode != "P"
-            if data[_PNG_BITS] == 16:
-                pixels = _decode_with_opencv(data)
-                if is_one_grey and pixels.shape[2] == 3:  # OpenCV passed it over
-                    pixels = np.dstack([pixels, np.where(pixels[..., 0] == clear, 0, 65535).astype(np.uint16)])
-                return _to_float(pixels)
-            if is_one_grey and image.mode == "L":  # Pillow spreads 2 and 4 bits over 8, but not this number
-                image.info["transparency"] = clear * (255 // (2 ** data[_PNG_BITS] - 1))
+        file = io.BytesIO(data)
+        image = plugin(file)
+        if image.format == "TIFF":
+            return _decode_tiff(image, data)
+        if image.format == "JPEG":
+            return _to_float(_decode_jpeg(image, data, file.tell()))
+        if image.format == "PNG":
+            plugin(io.BytesIO(data)).verify()  # the check sums, which decoders pass over
+            return _to_float(_decode_png(image, data))
         return _to_float(_decode_with_pillow(image))
     except (ValueError, MemoryError):
         raise
-    except Exception as error:  # neither Pillow, kornia_rs nor OpenCV has one class of errors for damage
+    except Exception as error:  # neither Pillow, Kornia nor OpenCV has one class of errors for damage
         raise ValueError("the image is damaged, truncated, or has other colours than grey or RGB") from error
 
 
@@ -388,37 +347,49 @@ def _decode_with_opencv(data: bytes) -> NDArray[np.uint8 | np.uint16]:
     return np.asarray(cv2.cvtColor(image, _TO_RGB[channels]))
 
 
-def _decode_jpeg(data: bytes) -> NDArray[np.uint8]:
-    """RGB of a JPEG. What lies behind its end, such as a phone's video, is ignored."""
-    file = io.BytesIO(data)
-    image = _open("JPEG", file)
+def _decode_png(image: Opened, data: bytes) -> NDArray[np.uint8 | np.uint16]:
+    """RGB or RGBA of a PNG."""
+    bits = data[_PNG_BITS]
+    clear = image.info.get("transparency")
+    is_one_grey = isinstance(clear, int) and image.mode != "P"
+    if is_one_grey:  # OpenCV passes it over, and Pillow does not spread its bits over 8, as it does those of pixels
+        del image.info["transparency"]
+    pixels = _decode_with_opencv(data) if bits == 16 else _decode_with_pillow(image)
+    if not is_one_grey:
+        return pixels
+    maximum = np.iinfo(pixels.dtype).max
+    clear = clear % 2**bits * (maximum // (2**bits - 1))  # its last bits count
+    alpha = np.where(pixels[..., 0] == clear, 0, maximum)
+    return np.dstack([pixels[..., :3], alpha.astype(pixels.dtype)])
+
+
+def _decode_jpeg(image: Opened, data: bytes, end: int) -> NDArray[np.uint8]:
+    """RGB of a JPEG, the header of whose first scan has this end. What lies behind the image is ignored."""
     if image.mode == "CMYK":
         raise ValueError("expected a JPEG of grey or RGB, got CMYK: convert it to RGB")
-    end = file.tell()  # of the header of the first scan
     # Only progressive images use its last three bytes. In others some phones leave them 0, and decoders warn of it.
     if "progressive" not in image.info and data[end - 3 : end] == b"\0\0\0":
         data = data[: end - 3] + b"\0\x3f\0" + data[end:]
     return np.asarray(kornia_io.decode_image_jpegturbo(data, "rgb"))
 
 
-def _decode_tiff(data: bytes) -> Image:
+def _decode_tiff(image: Opened, data: bytes) -> Image:
     """RGB or RGBA in [0, 1] of a TIFF, as stored, its colours not multiplied by alpha."""
-    image = _open("TIFF", io.BytesIO(data))
     tags = image.tag_v2  # type: ignore[attr-defined]  # of TIFF only
-    if lab := _LAB.get(int(tags.get(_COLORS, 2))):
+    if lab := _LAB.get(int(tags.get(Base.PhotometricInterpretation, 2))):
         raise ValueError(f"expected a TIFF of grey or RGB, got {lab}")
-    orientation = int(tags.get(_ORIENTATION, 1))
-    samples = int(tags.get(_SAMPLES, 1))
-    alpha = tags.get(_EXTRA_SAMPLES, (0,))[0]
-    bits = max(tags.get(_BITS, (1,)))
+    orientation = int(tags.get(Base.Orientation, 1))
+    samples = int(tags.get(Base.SamplesPerPixel, 1))
+    alpha = tags.get(Base.ExtraSamples, (0,))[0]
+    bits = max(tags.get(Base.BitsPerSample, (1,)))
     # Pillow leaves out a fourth sample of unspecified meaning and rounds when it divides colours by alpha.
-    if tags.get(_COLORS) == _CMYK and bits <= 8 and samples == 4:
+    if tags.get(Base.PhotometricInterpretation) == _CMYK and bits <= 8 and samples == 4:
         pixels = _to_float(np.asarray(cmyk_to_rgb(image, image.info.get("icc_profile", b""))))
     elif bits <= 8 and (samples != 4 or alpha == _ALPHA):
         pixels = _to_float(_decode_with_pillow(image))
     else:
         pixels = _to_float(_decode_with_opencv(data))
-        if tags.get(_COLORS) == _WHITE_IS_ZERO:  # which OpenCV passes over
+        if tags.get(Base.PhotometricInterpretation) == _WHITE_IS_ZERO:  # which OpenCV passes over
             pixels[..., :3] = 1 - pixels[..., :3]
     if samples in (2, 4) and alpha == _MULTIPLIED_ALPHA:
         pixels[..., :3] = np.minimum(pixels[..., :3] / np.maximum(pixels[..., 3:], 1 / 65535), 1)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
+import PIL.ImageFile
 import pytest
 from photo_folders import planes, write_photos
 from tiny_scenes import write_blender, write_colmap, write_llff, write_nerfstudio
@@ -42,9 +43,9 @@ def decoded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     sizes: list[int] = []
     real = image_file._decode
 
-    def decode(kind: str, data: bytes) -> np.ndarray:
+    def decode(plugin: type[PIL.ImageFile.ImageFile], data: bytes) -> np.ndarray:
         sizes.append(len(data))
-        return real(kind, data)
+        return real(plugin, data)
 
     monkeypatch.setattr(image_file, "_decode", decode)
     return sizes

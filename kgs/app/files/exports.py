@@ -21,7 +21,7 @@ from kgs.ply import float32_moves
 
 
 def write_exports(fit: Fit, folder: Path, roll: float = 0.0) -> list[str]:
-    """Write `outputs.EXPORTS` with one of the films; returns notes that say why there is none, or no MP4.
+    """Write `outputs.EXPORTS` with one of the films; returns notes that say why there is none.
 
     `roll` turns the pictures of the film, and with them what is up in the glTF file, see
     :func:`kgs.app.files.cameras.rolled`.
@@ -30,15 +30,14 @@ def write_exports(fit: Fit, folder: Path, roll: float = 0.0) -> list[str]:
     write_splat_exports(fit, folder, roll)
     poses = _poses(fit, roll)
     depth = typical_depths(fit.model.means, scene.train.cameras)[1]
-    suffix, note = film_suffix()
     near_plane = path_near_plane(fit.model.means, scene.train.cameras, fit.options.near_plane)
     film_fit = replace(fit, options=replace(fit.options, near_plane=near_plane))
     frames = rolled(scene.train, roll)
     height, width = frames.images.shape[-2:]
     frames = replace(frames, cameras=pinholes(frames.cameras.intrinsics, poses, (height, width)))
     write_preview(folder / "preview.jpg", film_fit.render, frames)
-    why = write_film(folder / f"turntable{suffix}", film_fit.render, frames, depth, each)
-    return [line for line in (why, note) if line]
+    why = write_film(folder / f"turntable{film_suffix()}", film_fit.render, frames, depth, each)
+    return [why] if why else []
 
 
 def write_splat_exports(fit: Fit, folder: Path, roll: float = 0.0) -> None:

@@ -166,15 +166,13 @@ def camera_path(extrinsics: Tensor, shares: Array, depth: float) -> Tensor:
     poses = torch.linalg.inv(extrinsics.double().cpu())  # camera to world
     if len(poses) == 1:
         return _sway(poses[0], shares, depth)
-    distances = _distances(poses)
-    order = _round_trip(distances)
+    order = _round_trip(_distances(poses))
     order = [order[i] for i in np.linspace(0, len(order), min(_STOPS, len(order)), endpoint=False).astype(int)]
-    times = np.array([distances[a, b] for a, b in zip(order, order[1:] + order[:1], strict=True)]).clip(1e-6)
     centers = poses[order, :3, 3]
     rotations = poses[order, :3, :3]
     focus = meeting_point(extrinsics[order])
     if focus is None:
-        centers, rotations = _interpolated(centers, rotations, times, shares)
+        centers, rotations = _interpolated(centers, rotations, shares)
         return _extrinsics(centers, rotations)
 
     # Interpolate the direction and the distance from the focus, and the rotation relative to looking at it.
@@ -182,7 +180,7 @@ def camera_path(extrinsics: Tensor, shares: Array, depth: float) -> Tensor:
     radii = (centers - focus).norm(dim=1, keepdim=True)
     rotations = _looking_at(focus, centers, down).mT @ rotations
     polar = torch.cat([(centers - focus) / radii, radii], 1)
-    polar, rotations = _interpolated(polar, rotations, times, shares)
+    polar, rotations = _interpolated(polar, rotations, shares)
     centers = focus + polar[:, 3:] * normalize(polar[:, :3], dim=1)
     return _extrinsics(centers, _looking_at(focus, centers, down) @ rotations)
 
@@ -241,44 +239,30 @@ def _round_trip(distances: Array) -> list[int]:
     return order
 
 
-def _interpolated(vectors: Tensor, rotations: Tensor, times: Array, shares: Array) -> tuple[Tensor, Tensor]:
-    """Vectors `(V, D)` and rotations `(V, 3, 3)` along a closed path: `(frames, D)` and `(frames, 3, 3)`.
-
-    `times` has V durations, each from one stop to the next.
-    """
+def _interpolated(vectors: Tensor, rotations: Tensor, shares: Array) -> tuple[Tensor, Tensor]:
+    """Vectors `(V, D)` and rotations `(V, 3, 3)` along a closed path: `(frames, D)` and `(frames, 3, 3)`."""
     quaternions = rotation_matrix_to_quaternion(rotations.contiguous())
-    rows = torch.from_numpy(_closed_spline(torch.cat([vectors, quaternions], 1).numpy(), times, shares))
+    rows = torch.from_numpy(_closed_spline(torch.cat([vectors, quaternions], 1).numpy(), shares))
     return rows[:, :-4], quaternion_to_rotation_matrix(rows[:, -4:])
 
 
-def _closed_spline(stops: Array, times: Array, shares: Array) -> Array:
-    """Rows of a cubic spline through the stops `(V, D)` at these shares of its time: `(frames, D)`.
+def _closed_spline(stops: Array, shares: Array) -> Array:
+    """Rows of a closed cubic spline through the stops `(V, D)`, which are at equal shares of it: `(frames, D)`.
 
-    The last four columns are quaternions, not normalised. `times` has V durations, each from one stop to the next.
+    The last four columns are quaternions, not normalised. A tangent is the harmonic mean of the steps before and after
+    its stop, or 0 where their signs differ.
     """
     n = len(stops)
     values = stops[np.arange(-1, n + 2) % n]  # the last stop, all stops, the first two again
     for previous, value in pairwise(values):
         if value[-4:] @ previous[-4:] < 0:  # q and -q are the same rotation: take the nearer one
             value[-4:] *= -1.0
-    steps = times[np.arange(-1, n + 1) % n, None]
-    slopes = np.diff(values, axis=0) / steps
-    tangents = _tangents(slopes[:-1], slopes[1:], steps[:-1], steps[1:])
+    steps = np.diff(values, axis=0)
+    products = steps[:-1] * steps[1:]
+    tangents = np.divide(2 * products, steps[:-1] + steps[1:], out=np.zeros_like(products), where=products > 0)
 
-    ends = np.cumsum(times)
-    instants = ends[-1] * shares
-    i = np.searchsorted(ends, instants, side="right").clip(max=n - 1)  # which stop comes before
-    u = ((instants - ends[i]) / times[i] + 1)[:, None]  # 0 at this stop, 1 at the next one
-    position = (1 + 2 * u) * (1 - u) ** 2 * values[i + 1] + u * u * (3 - 2 * u) * values[i + 2]
-    rows: Array = position + times[i, None] * (u * (1 - u) ** 2 * tangents[i] - u * u * (1 - u) * tangents[i + 1])
+    i = (n * shares).astype(int).clip(max=n - 1)  # which stop comes before
+    u = (n * shares - i)[:, None]  # 0 at this stop, 1 at the next one
+    bend = u * (1 - u) * ((1 - u) * tangents[i] - u * tangents[i + 1])
+    rows: Array = values[i + 1] + u * u * (3 - 2 * u) * steps[i + 1] + bend
     return rows
-
-
-def _tangents(before: Array, after: Array, step_before: Array, step_after: Array) -> Array:
-    """Tangents by Fritsch and Butland: a weighted harmonic mean of both slopes, or 0 where their signs differ."""
-    extremum = before * after <= 0
-    before = np.where(extremum, 1.0, before)
-    after = np.where(extremum, 1.0, after)
-    weights = (2 * step_after + step_before) / before + (step_after + 2 * step_before) / after
-    tangents: Array = np.where(extremum, 0.0, 3 * (step_before + step_after) / weights)
-    return tangents
