@@ -68,21 +68,29 @@ def extremes(*, out: Out) -> int:
 
 def check_speed(out: Path, device: str, **_: Any) -> None:
     """Check the arguments of `kgs bench speed`."""
-    from kgs.app.files.outputs import check_folder
-
     from .checks import check_installed
 
     check_installed(device, "auto", "matplotlib")
-    check_folder(out, make=False)
+    _check_out(out, "speed", "scaling.png")
 
 
 def check_precision(out: Path, **_: Any) -> None:
     """Check the arguments of `kgs bench precision`."""
-    check_speed(out, "cpu")
+    from .checks import check_installed
+
+    check_installed("cpu", "auto", "matplotlib")
+    _check_out(out, "precision", "render.png", "gradients.png")
 
 
 def check_extremes(out: Path, **_: Any) -> None:
     """Check the arguments of `kgs bench extremes`."""
+    _check_out(out, "extremes")
+
+
+def _check_out(out: Path, name: str, *pictures: str) -> None:
+    """Check the folder of a benchmark, which writes three files of its name and pictures."""
     from kgs.app.files.outputs import check_folder
+    from kgs.app.files.publishing import check_free
 
     check_folder(out, make=False)
+    check_free(out, f"bench {name}", (f"{name}.csv", f"{name}.json", f"{name}.md", *pictures))

@@ -156,7 +156,7 @@ def check_clean(
 
     check_options(downscale, None)
     check_installed(device, backend)
-    check_file(out, ".ply", splat)
+    check_file(out, ".ply", "clean", splat)
     if cameras is not None:
         check_scene(cameras)
     if splat.is_dir():

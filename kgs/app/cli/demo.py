@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kgs._support.errors import DataError, printable
+from kgs._support.errors import printable
 from kgs.app.console import VIEWER, as_line, each, say, say_next
 from kgs.fit.config import DEMO, DEMO_STEPS, DROP, Backend, FitConfig
 
@@ -129,7 +129,8 @@ def _level(measures: dict[str, Any]) -> float:
 def check_demo(out: Path, size: tuple[int, int], steps: int, device: str, backend: str, **_: Any) -> None:
     """Check the arguments of `kgs demo`."""
     from kgs.app.files.outputs import check_folder
-    from kgs.app.files.publishing import read_marker
+    from kgs.app.files.publishing import check_free
+    from kgs.app.files.results_folder import SPLAT_FILES
 
     from .checks import check_installed
 
@@ -138,5 +139,4 @@ def check_demo(out: Path, size: tuple[int, int], steps: int, device: str, backen
         raise ValueError(f"size: expected at least 12 pixels a side, got {size[0]} {size[1]}")
     check_installed(device, backend, "jinja2")
     check_folder(out, make=False)
-    if "fit" in read_marker(out):
-        raise DataError(out, "", "holds the results of kgs fit: choose another folder")
+    check_free(out, "demo", (*SPLAT_FILES, "metrics.json", "curve.png", "demo.png"))

@@ -54,6 +54,7 @@ def evaluate(
 
 def check_evaluate(out: Path, lpips_weights: Path | None, device: str, backend: str, **_: Any) -> None:
     """Check the arguments of `kgs eval`."""
+    from kgs.app.files.publishing import check_free
     from kgs.metrics.weights import weight_files
 
     from .checks import check_installed, check_results
@@ -62,3 +63,4 @@ def check_evaluate(out: Path, lpips_weights: Path | None, device: str, backend: 
     if lpips_weights is not None:
         weight_files(lpips_weights)
     check_results(out)
+    check_free(out, "fit", ("metrics.json", "index.html"))

@@ -53,4 +53,4 @@ def check_export(ply: Path, out: Path, **_: Any) -> None:
     from .checks import check_file, check_installed
 
     check_installed("cpu", "auto")
-    check_file(out, ".ply", ply)
+    check_file(out, ".ply", "export", ply)

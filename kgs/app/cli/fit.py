@@ -3,6 +3,7 @@
 import os
 import re
 import warnings
+from contextlib import nullcontext
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -86,7 +87,7 @@ def fit(
             without dropping. See --preset paper --help-all.
         detail: sets size, steps and initial points together. low: 378 pixels. high: 1000 pixels. Options given by name
             win. See --detail high --help-all.
-        resume: continue from the checkpoint in the folder of the results.
+        resume: continue the unfinished fit in the folder of the results, or the finished one.
         title: of the page. Unless given: the name of the folder.
         photos: --no-photos leaves the photos out of the page.
         roll: turn page and film clockwise by so many degrees.
@@ -198,11 +199,15 @@ def check_fit(
     frames: int | None,
     roll: float,
     lpips_weights: Path | None,
+    resume: bool,
     config: FitConfig,
     **_: Any,
 ) -> None:
     """Check the arguments of `kgs fit`."""
+    from kgs.app.files.locks import locked
     from kgs.app.files.outputs import check_folder
+    from kgs.app.files.publishing import UNFINISHED
+    from kgs.app.files.results_folder import check_fit_files
     from kgs.app.sfm.find import MIN_PHOTOS, find_video
     from kgs.datasets.folders import layout_of
     from kgs.datasets.options import check_options
@@ -233,6 +238,8 @@ def check_fit(
     if lpips_weights is not None:
         weight_files(lpips_weights)
     check_folder(out, scene, make=False)
+    with locked(out) if (out / UNFINISHED).is_dir() else nullcontext():
+        check_fit_files(out, resume)
     if unposed:
         if config.init == "scene":
             raise ValueError(

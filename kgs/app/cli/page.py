@@ -106,5 +106,5 @@ def check_page(
     check_roll(roll)
     check_options(downscale, None)
     check_installed(device, backend, "jinja2")
-    check_file(out, ".html")
+    check_file(out, ".html", "page")
     check_scene(cameras)

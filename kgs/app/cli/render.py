@@ -43,7 +43,7 @@ def render(
 
     from kgs.app.files.cameras import as_taken
     from kgs.app.files.outputs import check_folder, png_names, write_png
-    from kgs.app.files.publishing import replacing
+    from kgs.app.files.publishing import check_free, replacing
     from kgs.camera import move_camera
     from kgs.renderer import GaussianRenderer
 
@@ -54,6 +54,7 @@ def render(
     renderer = GaussianRenderer(options=fit.options, backend=backend).eval()
     names = png_names(scene.train.names)
     check_folder(out, scene.root)
+    check_free(out, "renders", names.values())
     color = scene.background.to(torch_device)
     outputs = ("image", "alpha") if is_transparent else ("image",)
     with replacing(out, "renders") as new, torch.no_grad():

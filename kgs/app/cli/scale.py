@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kgs._support.errors import DataError, printable
+from kgs._support.errors import printable
 from kgs.app.console import as_line, say, say_next
 
 from .options import Existing, Out
@@ -88,7 +88,8 @@ def _point(text: str) -> list[float]:
 def check_scale(splat: Path, by: tuple[str, str, float], out: Path, **_: Any) -> None:
     """Check the arguments of `kgs scale`."""
     from kgs.app.files.outputs import check_folder
-    from kgs.app.files.publishing import read_marker
+    from kgs.app.files.publishing import check_free
+    from kgs.app.files.results_folder import SPLAT_FILES
 
     from .checks import check_file, check_installed, check_results
 
@@ -102,8 +103,7 @@ def check_scale(splat: Path, by: tuple[str, str, float], out: Path, **_: Any) ->
         check_installed("cpu", "auto", "jinja2", "safetensors")
         check_results(splat)
         check_folder(out, make=False)
-        if "fit" in read_marker(out):
-            raise DataError(out, "", "holds the results of kgs fit: choose another folder")
+        check_free(out, "scale", SPLAT_FILES)
         return
     check_installed("cpu", "auto")
-    check_file(out, ".ply", splat)
+    check_file(out, ".ply", "scaled", splat)
