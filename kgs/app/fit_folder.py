@@ -20,13 +20,14 @@ from kgs.app.files.cameras import as_taken
 from kgs.app.files.figures import write_curve
 from kgs.app.files.locks import locked
 from kgs.app.files.outputs import check_folder, png_names, write_png
-from kgs.app.files.publishing import begin, complete, discard, enter, publish, replacing, unpublished
+from kgs.app.files.publishing import UNFINISHED, discard, enter, publish, replacing
 from kgs.app.files.results_folder import (
     CHECKPOINT,
     PREVIOUS,
+    check_fit_files,
     discard_fit,
+    has_fit,
     is_finished,
-    resumable_fits,
     step_of,
 )
 from kgs.app.live import LivePage
@@ -48,6 +49,7 @@ from .scene_request import SceneRequest
 from .stages import Stages
 
 _SAVE_SECONDS = 60.0
+_TEST = "test"  # folder of the renders of test views
 
 
 class Published(NamedTuple):
@@ -55,9 +57,7 @@ class Published(NamedTuple):
 
     fit: Fit
     signal: int  # that ended the training, or 0
-    folder: (
-        Path  # where the results are: `out`, or a folder in it if a signal ended this fit and `out` has a better one
-    )
+    folder: Path  # of the results: `out`, or one in it if a signal ended this fit and `out` has a better one
 
 
 def fit_folder(
@@ -74,7 +74,7 @@ def fit_folder(
 ) -> Published:
     """Fit a scene and write all results of `kgs fit`: splat, film, page, metrics, test images and checkpoints.
 
-    New results are collected in a folder of their own in `out`, and replace those of a former fit only when all are
+    New results are collected in the folder `unfinished` in `out`, and replace those of a former fit only when all are
     there. A fit that a signal stopped writes its results too, but replaces neither a finished fit nor one that got
     further.
 
@@ -83,8 +83,7 @@ def fit_folder(
         config: the settings of the fit.
         out: the folder for the results, created if it does not exist.
         request: how the scene was loaded, for config.json, and how the page shows it.
-        resume: continue the unfinished fit in the folder that got furthest and has these settings, else the finished
-            one.
+        resume: continue the fit in `out/unfinished`, or if there is none that in `out`.
         lpips: the perceptual metric, or None to leave it out.
         live: show the splat during the fit on a page on this machine, see :class:`kgs.app.live.LivePage`.
         say: called with each line for the user.
@@ -92,7 +91,8 @@ def fit_folder(
 
     Raises:
         DataError: the checkpoint is damaged or belongs to another fit, images are too small, another fit is at work in
-            `out`, or `out` cannot be written to or holds the files of a scene.
+            `out`, `out` cannot be written to or holds the files of a scene, what no fit wrote has the name of a result,
+            or there is an unfinished fit and `resume` is False.
         TrainingDiverged: a number is not finite, or a scale explodes; the last checkpoint is kept.
         OSError: a result cannot be written.
         ValueError: the device cannot be used, or the backend does not run on it.
@@ -107,20 +107,22 @@ def fit_folder(
     names = png_names([*scene.train.names, *scene.test.names])
     _check_out(out, scene)
     with locked(out), ExitStack() as until_the_end:
-        complete(out, say)
-        trainer, work = _trainer(scene, config, plan, out, resume, say, stages)
+        check_fit_files(out, resume, [f"{_TEST}/{names[view]}" for view in scene.test.names])
+        work = out / UNFINISHED
+        trainer = _trainer(scene, config, plan, out, resume, say, stages)
+        work.mkdir(exist_ok=True)
         notes = _Notes(trainer, say)
         is_trained = False
         try:
             if not (work / CHECKPOINT).exists():
                 save_checkpoint(work / CHECKPOINT, trainer.state_dict())  # initial points can take a minute
-            with replacing(work, "fit", say=say) as new:
+            with replacing(work, "fit") as new:
                 write_json(new / "config.json", _settings(trainer, request))
             stages.begin("fit")
             page = until_the_end.enter_context(_live_page(trainer, request, out, say)) if live else None
             fit, stopped_by = train(trainer, work / CHECKPOINT, live=page)
             is_trained = True
-            with replacing(work, "fit", keep_on_error=True, say=say) as new:
+            with replacing(work, "fit", keep_on_error=True) as new:
                 stages.begin("film")
                 fit = _write_results(fit, new, names, request, lpips)
                 for note in fit.notes:
@@ -135,7 +137,7 @@ def fit_folder(
                 notes.say_new()
                 say(f"{printable(new)}: holds the results that could be written")
             elif not trainer.saved:
-                discard_fit(work, say)
+                discard_fit(work)
             raise
         folder = out
         is_done = trainer.step >= trainer.plan.schedule.steps
@@ -144,15 +146,9 @@ def fit_folder(
             kept = f"{printable(out)} keeps its {_state(out)}; this one is in {printable(work)}"
             trainer.state.note(f"{kept}, where a resumed fit goes on")
         else:
-            others = {other: step_of(other) for other in unpublished(out, "fit") if other != work}
-            root = Path(scene.root).resolve()
-            own = [photos for photos in unpublished(out, "photos") if photos.resolve() == root]
-            publish(work, out, all_former=True, say=say, along=own)
-            for other, step in others.items():
-                if is_done or step <= trainer.step:
-                    discard_fit(other, say)
-            for photos in () if unpublished(out, "fit") else unpublished(out, "photos"):
-                discard(photos, say=say)  # no fit waits for them any more
+            if Path(scene.root).resolve() != work.resolve():
+                discard(work, "photos")  # of another fit: those of this one are published with it
+            publish(work, out)
         notes.say_new()
         if page is not None:
             how = f"was stopped at step {trainer.step}" if stopped_by else "is done"
@@ -185,45 +181,25 @@ def _check_out(out: Path, scene: Scene) -> None:
 
 def _trainer(
     scene: Scene, config: FitConfig, plan: Plan, out: Path, resume: bool, say: Callable[[str], None], stages: Stages
-) -> tuple[Trainer, Path]:
-    """A trainer that begins, or one that continues; and the folder of its new results."""
-    fits = resumable_fits(out)
-    if resume and fits:
-        trainer, folder = _resumed(scene, config, fits, say)
-        return trainer, begin(out, "fit") if folder == out else folder
+) -> Trainer:
+    """A trainer that begins, or one that continues."""
+    former = next((folder for folder in (out / UNFINISHED, out) if has_fit(folder)), None)
+    if resume and former is not None:
+        trainer = Trainer.resume(scene, config, former / CHECKPOINT)
+        say(f"resumed at step {trainer.step}")
+        return trainer
     if resume:
         say(f"{printable(out)}: there is nothing to resume: the fit starts at the beginning")
-    elif fits:
-        what = _state(fits[0])
-        until = "this one is done" if is_finished(fits[0]) else "one is done or gets further"
-        say(f"{printable(fits[0])}: keeps its {what}, until {until}; to go on with it, use --resume")
+    elif former is not None:
+        until = "this one is done" if is_finished(out) else "this one is done or gets further"
+        say(f"{printable(out)}: keeps its {_state(out)}, until {until}; to go on with it, use --resume")
     stages.begin("initial points")
     points = choose_points(scene, config, each)
     say(f"initial points: {len(points.points)} ({points.kind})")
     plan = decide(plan, points)
     memory = expected_memory(scene, gaussian_limit(plan.config, len(points.points)))
     say(f"the fit takes up to {memory / 2**30:.1f} GiB of memory")
-    return Trainer(scene, plan, points), begin(out, "fit")
-
-
-def _resumed(scene: Scene, config: FitConfig, folders: list[Path], say: Callable[[str], None]) -> tuple[Trainer, Path]:
-    """The trainer of the first of several folders whose fit has these settings, and that folder.
-
-    If there is none: a DataError about the first one.
-    """
-    refused: DataError | None = None
-    for folder in folders:
-        try:
-            trainer = Trainer.resume(scene, config, folder / CHECKPOINT)
-        except DataError as error:
-            refused = refused or error
-            continue
-        if refused is not None:
-            say(str(refused))
-        say(f"resumed at step {trainer.step}")
-        return trainer, folder
-    assert refused is not None  # there is a folder
-    raise refused
+    return Trainer(scene, plan, points)
 
 
 def _live_page(
@@ -273,12 +249,12 @@ def _write_results(fit: Fit, folder: Path, names: dict[str, str], request: Scene
     save_ply(folder / "splat.ply", fit.model, offset=scene.offset)
     write_curve(folder / "curve.png", {"": fit.history["curve"]})
     notes = write_exports(fit, folder, request.roll)
-    (folder / "test").mkdir(exist_ok=True)
+    (folder / _TEST).mkdir()
     with progress(len(scene.test), "test pictures", unit="view") as advance:
 
         def write_picture(i: int, image: Tensor) -> None:
             picture = as_taken(scene.test.as_photo(i, image[0]), scene.test, i)
-            write_png(folder / "test" / names[scene.test.names[i]], picture)
+            write_png(folder / _TEST / names[scene.test.names[i]], picture)
             advance()
 
         metrics = measure(fit, lpips, write_picture)

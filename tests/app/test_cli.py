@@ -17,10 +17,12 @@ from command import one_line, run
 from tiny_scenes import write_colmap
 
 import kgs
+from kgs._support.json_files import write_json
 from kgs.app.cli.fit import first_config
 from kgs.app.cli.run import COMMANDS, load_command
 from kgs.app.cli.tools import explain_import_error, load_package, load_tools
 from kgs.app.files.outputs import EXPORTS, FILMS
+from kgs.app.files.publishing import replacing
 from kgs.app.files.results_folder import CHECKPOINT, PREVIOUS
 from kgs.fit.config import DETAILS, DROP, PAPER, PRESETS, FitConfig
 
@@ -85,6 +87,12 @@ def test_render_gives_the_pictures_of_fit(fitted, folder, tmp_path):
         assert np.abs(one - two).max() <= 1
 
 
+def write_as_kgs(path, values):
+    """Write a file of a fit, and enter it in the marker."""
+    with replacing(path.parent, "fit") as new:
+        write_json(new / path.name, values)
+
+
 def test_eval_measures_the_same_and_keeps_the_rest(fitted, capsys):
     path = fitted / "metrics.json"
     before = json.loads(path.read_text())
@@ -93,7 +101,7 @@ def test_eval_measures_the_same_and_keeps_the_rest(fitted, capsys):
     before["peak_rss_mb"] = 1
     wrong = json.loads(json.dumps(before))
     wrong["test"]["psnr"] = wrong["train"]["views"][0]["ssim"] = 1.0
-    path.write_text(json.dumps(wrong))
+    write_as_kgs(path, wrong)
     assert run("eval", fitted) == 0
     assert json.loads(path.read_text()) == before
     assert "PSNR" in capsys.readouterr().out
@@ -109,7 +117,7 @@ def test_eval_refuses_measures_of_other_views(fitted, capsys, tmp_path):
     path = tmp_path / "copy" / "metrics.json"
     metrics = json.loads(path.read_text())
     metrics["test"]["views"][0]["name"] = "another"
-    path.write_text(json.dumps(metrics))
+    write_as_kgs(path, metrics)
     assert run("eval", tmp_path / "copy") == 2
     assert "has other views" in one_line(capsys)
     assert json.loads(path.read_text()) == metrics

@@ -30,7 +30,6 @@ def test_it_says_how_many_bytes_are_left(splat: Path, tmp_path: Path, capsys: An
     said = capsys.readouterr().out
     assert f"{out}: 300 Gaussians, 0.01 MB of 0.03" in said
     assert is_own(tmp_path, out.name)
-    assert not (tmp_path / "kept").exists()
     kgs.save_compressed_ply(tmp_path / "same.ply", kgs.load_ply(splat))
     assert out.read_bytes() == (tmp_path / "same.ply").read_bytes()
 
@@ -44,17 +43,16 @@ def test_an_origin_makes_map_coordinates_small(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("is_of_a_fit", [True, False])
-def test_another_file_of_this_name_is_kept(splat: Path, tmp_path: Path, capsys: Any, is_of_a_fit: bool) -> None:
+def test_another_file_of_this_name_is_refused(splat: Path, tmp_path: Path, capsys: Any, is_of_a_fit: bool) -> None:
     """The user's, or a result of another command."""
     if is_of_a_fit:
         with replacing(tmp_path, "fit") as new:
             (new / "a.ply").write_bytes(b"other")
     else:
         (tmp_path / "a.ply").write_bytes(b"other")
-    assert run("export", splat, "-o", tmp_path / "a.ply") == 0
-    assert "moved to kept/a.ply, because" in capsys.readouterr().out
-    assert (tmp_path / "kept" / "a.ply").read_bytes() == b"other"
-    assert len(decode(tmp_path / "a.ply")["means"]) == 300
+    assert run("export", splat, "-o", tmp_path / "a.ply") == 2
+    assert "holds a.ply, which this command did not write" in one_line(capsys)
+    assert (tmp_path / "a.ply").read_bytes() == b"other"
 
 
 def test_mistakes_are_a_line_and_change_nothing(splat: Path, tmp_path: Path, capsys: Any) -> None:

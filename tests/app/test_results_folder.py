@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 import signal
 import subprocess
@@ -23,15 +22,15 @@ from kgs.app.cli.demo import demo
 from kgs.app.cli.evaluate import evaluate
 from kgs.app.files import publishing
 from kgs.app.files.locks import locked
-from kgs.app.files.publishing import begin, enter, is_own, unpublished
-from kgs.app.files.results_folder import CHECKPOINT
+from kgs.app.files.publishing import UNFINISHED, is_own, read_marker, replacing
+from kgs.app.files.results_folder import CHECKPOINT, check_fit_files
 from kgs.app.saved_fit import load_fit
 from kgs.app.scene_request import SceneRequest
 from kgs.datasets.synthetic import synthetic_scene
 from kgs.fit import trainer as trainer_module
 from kgs.fit.checkpoint import load_checkpoint, previous, save_checkpoint
 from kgs.fit.config import DROP, FitConfig, Recipe
-from kgs.fit.plan import make_plan, with_step_defaults
+from kgs.fit.plan import with_step_defaults
 from kgs.fit.prune import prune
 from kgs.fit.trainer import Trainer
 from kgs.metrics import evaluate as measures
@@ -142,7 +141,7 @@ def test_results_of_a_full_disk_are_kept_where_no_checkpoint_could_be_written(
     lines: list[str] = []
     with pytest.raises(OSError, match="space") as error:
         fit(scene, CONFIG, tmp_path, say=lines.append)
-    (held,) = (tmp_path / "unfinished-1").glob(".kgs-*/")
+    (held,) = (tmp_path / UNFINISHED).glob(".kgs-*/")
     assert error.value.filename == str(held / "test" / "test_00.png")
     assert {"splat.ply", "curve.png", "cameras.json"} <= set(os.listdir(held))
     assert f"{held}: holds the results that could be written" in lines
@@ -200,14 +199,14 @@ def test_a_forged_checkpoint_is_refused(done: Path, changes: dict[str, Any], fie
 
 def killed_before_the_move(out: Path, patch: Any) -> None:
     """From now on a process is killed when all results are there, but none is in its place."""
-    plain = publishing.complete
+    plain = publishing.publish
 
-    def kill(folder: Path, *arguments: Any) -> None:
+    def kill(work: Path, folder: Path) -> None:
         if folder == out:
             raise KeyboardInterrupt
-        plain(folder, *arguments)
+        plain(work, folder)
 
-    patch.setattr(publishing, "complete", kill)
+    patch.setattr(app, "publish", kill)
 
 
 @pytest.mark.parametrize("moves", [0, 1, 3, 7])
@@ -216,7 +215,7 @@ def test_a_kill_while_files_are_moved(scene: Any, done: Path, monkeypatch: Any, 
     calls = []
 
     def killed(source: Any, target: Any) -> None:
-        if Path(source).parent.name == "unfinished-1" and Path(target).parent == done:
+        if Path(source).parent.name == UNFINISHED and Path(target).parent == done:
             calls.append(source)
         if len(calls) > moves:
             raise KeyboardInterrupt
@@ -248,25 +247,24 @@ def test_a_kill_before_files_are_moved(scene: Any, done: Path, monkeypatch: Any)
     assert folders(done) == ["test"]
 
 
-@pytest.mark.parametrize(("root", "is_published"), [(".", True), ("/photos", False)])
+@pytest.mark.parametrize("are_of_this_fit", [True, False])
 def test_cameras_that_waited_for_a_fit_come_with_it(
-    scene: Any, done: Path, monkeypatch: Any, root: str, is_published: bool
+    scene: Any, done: Path, monkeypatch: Any, are_of_this_fit: bool
 ) -> None:
     """After a kill, too: a fit never shows itself beside the cameras of another one."""
-    photos = begin(done, "photos")
-    scene = replace(scene, root=photos if is_published else Path("/photos"))
-    (photos / "photos.json").write_text("{}")
-    enter(photos, "photos")
+    photos = done / UNFINISHED
+    with replacing(photos, "photos") as new:
+        (new / "photos.json").write_text("{}")
+    scene = replace(scene, root=photos if are_of_this_fit else Path("/photos"))
     with monkeypatch.context() as patch, suppress(KeyboardInterrupt):
         killed_before_the_move(done, patch)
-        app.fit_folder(scene, OTHER, done, SceneRequest(root), say=lambda line: None)
+        fit(scene, OTHER, done)
     assert not (done / "photos.json").exists()
-    load_fit(done)
+    assert seed_of(done) == 0
+    fit(scene, OTHER, done, resume=True)
     assert seed_of(done) == 1
-    assert (done / "photos.json").exists() == is_published
-    assert unpublished(done, "photos") == ([] if is_published else [photos])
-    fit(scene, CONFIG, done)
-    assert unpublished(done, "photos") == []  # no fit waits for them any more
+    assert (done / "photos.json").exists() == ("photos" in read_marker(done)) == are_of_this_fit
+    assert folders(done) == ["test"]
 
 
 def test_eval_does_not_pass_off_the_checkpoint_of_another_step(scene: Any, done: Path) -> None:
@@ -295,7 +293,8 @@ def test_eval_does_not_write_over_a_fit_that_came_meanwhile(scene: Any, done: Pa
 
 
 def test_eval_says_how_to_go_on_with_a_fit_that_was_killed(tmp_path: Path) -> None:
-    begin(tmp_path, "fit")
+    (tmp_path / UNFINISHED).mkdir()
+    (tmp_path / UNFINISHED / CHECKPOINT).touch()
     with pytest.raises(DataError, match="kgs fit --resume"):
         evaluate(tmp_path)
 
@@ -308,38 +307,74 @@ def test_an_eval_that_fails_while_it_writes_changes_nothing(scene: Any, done: Pa
     assert contents(done) == before
 
 
-def test_what_another_fit_is_kept_until_is_said(scene: Any, done: Path) -> None:
+def test_what_another_fit_is_kept_until_is_said(scene: Any, done: Path, monkeypatch: Any) -> None:
     (first,) = [line for line in fit(scene, CONFIG, done) if "--resume" in line]
     assert first == f"{done}: keeps its finished fit, until this one is done; to go on with it, use --resume"
-    unfinished = begin(done, "fit")
-    shutil.copy(done / CHECKPOINT, unfinished)
-    (second,) = [line for line in fit(scene, CONFIG, done) if "--resume" in line]
-    assert second.startswith(f"{unfinished}: keeps its fit, which got to step 3, until one is done or gets further")
+    other = done / "other"
+    with monkeypatch.context() as patch:
+        interrupt_at(1, patch)
+        fit(scene, CONFIG, other)
+    (second,) = [line for line in fit(scene, CONFIG, other) if "--resume" in line]
+    assert second.startswith(f"{other}: keeps its fit, which got to step 2, until this one is done or gets further")
+
+
+def test_an_unfinished_fit_is_gone_on_with_or_the_next_one_is_refused(scene: Any, done: Path, monkeypatch: Any) -> None:
+    """Nobody's training is lost: whoever wants none of it removes the folder."""
+    interrupt_at(1, monkeypatch)
+    lines = fit(scene, OTHER, done)
+    work = done / UNFINISHED
+    assert f"{done} keeps its finished fit; this one is in {work}" in lines[-1]
+    assert (seed_of(done), seed_of(work)) == (0, 1)
+    assert is_own(work, "index.html")
+    monkeypatch.undo()
+    before = contents(done)
+    for check in (lambda: fit(scene, OTHER, done), lambda: check_fit_files(done, resume=False)):
+        with pytest.raises(
+            DataError, match="holds a fit that is not done: go on with it by --resume, or remove"
+        ) as error:
+            check()
+        assert error.value.path == work
+    with pytest.raises(DataError, match="seed: expected 1") as error:  # also with the settings of the finished one
+        fit(scene, CONFIG, done, resume=True)
+    assert error.value.path == work / CHECKPOINT
+    assert contents(done) == before
+    assert fit(scene, OTHER, done, resume=True)[0] == "resumed at step 2"
+    assert seed_of(done) == 1
     assert folders(done) == ["test"]
 
 
 def test_a_demo_does_not_mix_with_a_fit(done: Path) -> None:
-    with pytest.raises(DataError, match="holds the results of kgs fit"):
+    with pytest.raises(DataError, match="holds .*splat.ply.*, which this command did not write"):
         demo(out=done, size=(24, 32), steps=3)
 
 
-def test_a_file_that_the_user_writes_or_changes_during_a_fit_is_kept(scene: Any, done: Path, monkeypatch: Any) -> None:
-    """In the folder of the results and in that of the unfinished fit; and a line says where."""
+@pytest.mark.parametrize("name", ["cameras.json", f"{UNFINISHED}/splat.ply"])
+def test_a_file_that_the_user_writes_during_a_fit_is_not_replaced_and_no_training_lost(
+    scene: Any, done: Path, monkeypatch: Any, name: str
+) -> None:
+    """In the folder of the results and in that of the unfinished fit."""
     plain = Trainer._optimize
+    mine = done / name
+    notes = (done / "notes.txt", done / UNFINISHED / "notes.txt")
 
     def meanwhile(self: Trainer) -> float:
-        for name in ("cameras.json", "notes.txt", "unfinished-1/notes.txt", "unfinished-1/splat.ply"):
-            (done / name).write_text("mine")
+        for path in (mine, *notes):
+            path.write_text("mine")
         return plain(self)
 
-    monkeypatch.setattr(Trainer, "_optimize", meanwhile)
-    lines = fit(scene, OTHER, done)
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "_optimize", meanwhile)
+        with pytest.raises(DataError, match=f"holds {mine.name}, which this command did not write"):
+            fit(scene, OTHER, done)
+    assert json.loads((done / "metrics.json").read_text())["seed"] == 0
+    with pytest.raises(DataError, match=f"holds {mine.name}, which"):
+        fit(scene, OTHER, done, resume=True)
+    assert mine.read_text() == "mine"
+    mine.unlink()
+    fit(scene, OTHER, done, resume=True)
     assert seed_of(done) == 1
-    for name in ("kept/cameras.json", "notes.txt", "unfinished-1/notes.txt", "unfinished-1/kept/splat.ply"):
-        assert (done / name).read_text() == "mine"
-    for name in ("kept/cameras.json", "kept/splat.ply"):
-        assert any(f"moved to {name}, because" in line for line in lines)
-    assert folders(done) == ["kept", "test", "unfinished-1"]
+    assert [path.read_text() for path in notes] == ["mine", "mine"]
+    assert folders(done) == ["test", UNFINISHED]
 
 
 def test_what_the_new_results_lack_goes_but_for_what_is_the_users(scene: Any, done: Path) -> None:
@@ -369,20 +404,6 @@ def interrupt_at(step: int, patch: Any) -> None:
     patch.setattr(Trainer, "_optimize", interrupted)
 
 
-def test_an_interrupted_fit_leaves_a_finished_one_in_its_place(scene: Any, done: Path, monkeypatch: Any) -> None:
-    interrupt_at(1, monkeypatch)
-    lines = fit(scene, OTHER, done)
-    unfinished = done / "unfinished-1"
-    assert f"{done} keeps its finished fit" in lines[-1]
-    assert seed_of(done) == 0
-    assert seed_of(unfinished) == 1
-    assert is_own(unfinished, "index.html")
-    monkeypatch.undo()
-    assert fit(scene, OTHER, done, resume=True)[0] == "resumed at step 2"
-    assert seed_of(done) == 1
-    assert folders(done) == ["test"]
-
-
 @pytest.mark.parametrize(("decided", "interrupted"), [(2, False), (6, True)])
 def test_a_fit_is_done_after_the_steps_that_the_photos_decided(
     scene: Any, done: Path, monkeypatch: Any, decided: int, interrupted: bool
@@ -393,31 +414,30 @@ def test_a_fit_is_done_after_the_steps_that_the_photos_decided(
         interrupt_at(3, monkeypatch)
     fit(scene, OTHER, done)
     assert seed_of(done) == (0 if interrupted else 1)
-    assert folders(done) == (["test", "unfinished-1"] if interrupted else ["test"])
+    assert folders(done) == (["test", UNFINISHED] if interrupted else ["test"])
 
 
 def test_what_got_further_is_kept_until_one_is_further_or_done(scene: Any, tmp_path: Path, monkeypatch: Any) -> None:
-    """The same command again and again, stopped at steps 4, 2, 5 of 7 and then never."""
+    """Stopped at step 4 of 7, again from the beginning at step 2, then resumed: at steps 3 and 5, and never."""
     config = replace(CONFIG, steps=7)
-    for stop, published, unfinished in ((4, 4, []), (2, 4, ["unfinished-1"]), (5, 5, [])):
+    for stop, resume, published, unfinished in (
+        (4, False, 4, []),
+        (2, False, 4, [UNFINISHED]),
+        (3, True, 4, [UNFINISHED]),
+        (5, True, 5, []),
+    ):
         with monkeypatch.context() as patch:
             interrupt_at(stop - 1, patch)
-            fit(scene, config, tmp_path)
+            fit(scene, config, tmp_path, resume=resume)
         assert load_checkpoint(tmp_path / CHECKPOINT)["step"] == published
         assert folders(tmp_path) == ["test", *unfinished]
         assert seed_of(tmp_path) == 0
-    work = begin(tmp_path, "fit")  # and one that was killed further on
-    save_checkpoint(work / CHECKPOINT, load_checkpoint(tmp_path / CHECKPOINT) | {"step": 6})
-    with monkeypatch.context() as patch:
-        interrupt_at(5, patch)
-        assert fit(scene, config, tmp_path, resume=True)[0] == "resumed at step 6"
-    shutil.copytree(tmp_path, tmp_path.with_name("copy"))
-    assert fit(scene, config, tmp_path)[-1]
+    assert fit(scene, config, tmp_path, resume=True)[0] == "resumed at step 5"
     assert folders(tmp_path) == ["test"]
     assert load_checkpoint(tmp_path / CHECKPOINT)["step"] == 7
 
 
-def test_results_without_a_whole_checkpoint_are_kept_until_one_is_further(
+def test_results_without_a_checkpoint_are_kept_until_one_is_further(
     scene: Any, tmp_path: Path, monkeypatch: Any
 ) -> None:
     config = replace(CONFIG, steps=7)
@@ -426,62 +446,42 @@ def test_results_without_a_whole_checkpoint_are_kept_until_one_is_further(
             interrupt_at(stop - 1, patch)
             fit(scene, config, tmp_path)
         for name in (CHECKPOINT, previous(Path(CHECKPOINT)).name):
-            (tmp_path / name).write_bytes(b"damaged")
+            (tmp_path / name).unlink(missing_ok=True)
     assert json.loads((tmp_path / "metrics.json").read_text())["steps"] == 4
-    assert folders(tmp_path) == ["test", "unfinished-1"]
+    assert folders(tmp_path) == ["test", UNFINISHED]
 
 
-def test_the_fit_with_these_settings_is_gone_on_with(scene: Any, tmp_path: Path, monkeypatch: Any) -> None:
-    """Of several that were stopped; where none has them, the error is about the furthest."""
-    for config, stop in ((CONFIG, 2), (OTHER, 1)):
-        with monkeypatch.context() as patch:
-            interrupt_at(stop - 1, patch)
-            fit(scene, config, tmp_path)
-    assert [seed_of(tmp_path), seed_of(tmp_path / "unfinished-1")] == [0, 1]
-    with pytest.raises(DataError, match="seed: expected 0") as error:
-        fit(scene, replace(CONFIG, seed=2), tmp_path, resume=True)
-    assert error.value.path == tmp_path / CHECKPOINT
-    lines = fit(scene, OTHER, tmp_path, resume=True)
-    assert lines[1] == "resumed at step 1"
-    assert "seed" in lines[0]  # why not the furthest
-    assert seed_of(tmp_path) == 1
-
-
-def test_an_unfinished_fit_with_other_settings_is_not_lost_when_the_finished_one_is_resumed(
-    scene: Any, done: Path
-) -> None:
-    unfinished = Trainer(scene, make_plan(scene, OTHER), app.choose_points(scene, OTHER))
-    path = begin(done, "fit") / CHECKPOINT
-    unfinished.save(path)
-    kept = path.read_bytes()
-    message = f"{re.escape(str(path))}: steps: expected 3, as the fit was begun with"
-    with pytest.raises(DataError, match=message) as error:
-        fit(scene, replace(CONFIG, steps=5), done, resume=True)
-    assert error.value.path == path
-    assert path.read_bytes() == kept
-    shutil.rmtree(path.parent)
+def test_a_finished_fit_is_trained_on(scene: Any, done: Path) -> None:
     lines = fit(scene, replace(CONFIG, steps=5), done, resume=True)
     assert lines[0] == "resumed at step 3"
     assert "trained on from step 3" in lines[1]
     assert json.loads((done / "metrics.json").read_text())["steps"] == 5
 
 
-@pytest.mark.parametrize("name", ["unfinished-1/thesis.txt", "test/thesis.txt", "splat.ply", CHECKPOINT])
-def test_what_another_program_or_person_made_stays(scene: Any, tmp_path: Path, name: str) -> None:
-    """Also where it is a file of kgs by its name: that is moved."""
+@pytest.mark.parametrize(
+    ("name", "is_refused"),
+    [
+        *((f"{folder}/thesis.txt", False) for folder in (UNFINISHED, "test")),
+        *((name, True) for name in ("splat.ply", CHECKPOINT, "test", UNFINISHED)),
+        *((f"{UNFINISHED}/{name}", True) for name in ("splat.ply", CHECKPOINT)),
+    ],
+)
+def test_what_another_program_or_person_made_stays(
+    scene: Any, tmp_path: Path, monkeypatch: Any, name: str, is_refused: bool
+) -> None:
+    """Where it has the name of a result, the fit is refused before any work."""
     mine = tmp_path / name
     mine.parent.mkdir(exist_ok=True)
     mine.write_text("mine")
-    fit(scene, CONFIG, tmp_path)
-    kept = mine if mine.name == "thesis.txt" else tmp_path / "kept" / name
-    assert kept.read_text() == "mine"
-    assert seed_of(tmp_path) == 0
-
-
-def test_a_damaged_checkpoint_of_a_fit_does_not_stand_in_the_way(scene: Any, done: Path) -> None:
-    (done / CHECKPOINT).write_bytes(b"damaged")
-    fit(scene, OTHER, done)
-    assert seed_of(done) == 1
+    if is_refused:
+        monkeypatch.setattr(app, "choose_points", None)
+        with pytest.raises(DataError, match="move it away|remove this folder"):
+            fit(scene, CONFIG, tmp_path)
+        assert contents(tmp_path) in ({name: b"mine"}, {name: b"mine", ".lock": b""})
+    else:
+        fit(scene, CONFIG, tmp_path)
+        assert seed_of(tmp_path) == 0
+        assert mine.read_text() == "mine"
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a folder that even root cannot write to")

@@ -108,11 +108,12 @@ def test_two_points_and_a_length_are_needed(fitted: Path, tmp_path: Path, by: An
     assert not (tmp_path / "out").exists()
 
 
-def test_a_file_of_the_user_is_kept(fitted: Path, tmp_path: Path) -> None:
-    (tmp_path / "splat.ply").write_text("mine")
-    assert run("scale", fitted, "--by", A, B, LENGTH, "-o", tmp_path) == 0
-    assert (tmp_path / "kept" / "splat.ply").read_text() == "mine"
-    assert len(kgs.load_ply(tmp_path / "splat.ply"))
+def test_a_file_of_the_user_is_refused(fitted: Path, tmp_path: Path, capsys: Any) -> None:
+    for splat, out in ((fitted, tmp_path), (fitted / "splat.ply", tmp_path / "splat.ply")):
+        (tmp_path / "splat.ply").write_text("mine")
+        assert run("scale", splat, "--by", A, B, LENGTH, "-o", out) == 2
+        assert "holds splat.ply, which this command did not write" in one_line(capsys)
+        assert (tmp_path / "splat.ply").read_text() == "mine"
 
 
 def test_what_is_read_is_not_overwritten(fitted: Path, tmp_path: Path, capsys: Any) -> None:

@@ -280,10 +280,10 @@ def test_results_do_not_go_among_the_photos_or_over_another_scene(folder, tmp_pa
     for out, said in (
         (folder, "the photos themselves"),
         (tmp_path / "scene", "files of a scene"),
-        (tmp_path / "other", "kgs did not write"),
+        (tmp_path / "other", "did not write"),
     ):
         refused(folder, "choose another folder", out=out)
-        with pytest.raises(DataError, match=f"{said}.*: choose another folder"):
+        with pytest.raises(DataError, match=f"{said}.*choose another folder"):
             pose_photos(folder, out)
 
 
@@ -307,7 +307,7 @@ def test_a_users_photos_among_pictures_of_kgs_stay(folder, tmp_path):
     with replacing(images, "renders") as new:
         write_png(new / "render.png", torch.rand(3, 8, 8))
     before = (images / "IMG_1.png").read_bytes()
-    with pytest.raises(DataError, match="kgs did not write"):
+    with pytest.raises(DataError, match="did not write"):
         pose_photos(write_planes(folder), out)
     assert (images / "IMG_1.png").read_bytes() == before
 
@@ -333,73 +333,85 @@ def found(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("name", "kept"),
+    ("name", "said"),
     [
-        *((f"{name}/deeper/IMG_1.HEIC", "") for name in ("images", "sparse/0", "unfinished-1")),
-        *((name, "") for name in ("unfinished-1/notes.txt", "images/notes.txt", "checkpoint.safetensors")),
-        ("photos.json", "kept/photos.json"),
-        ("images", "kept/images"),
-        ("sparse/0/cameras.bin", "refused"),
+        *((f"{name}/deeper/IMG_1.HEIC", "") for name in ("images", "unfinished")),
+        *((name, "") for name in ("unfinished/notes.txt", "images/notes.txt", "checkpoint.safetensors")),
+        ("sparse/0/deeper/IMG_1.HEIC", "holds files of a scene"),
+        ("sparse/0/cameras.bin", "holds files of a scene"),
+        *((name, "did not write") for name in ("photos.json", "images", "images/1.png", "unfinished/photos.json")),
     ],
 )
-def test_a_users_own_files_stay(folder, tmp_path, found, name, kept):
+def test_a_users_own_files_stay(folder, tmp_path, found, name, said):
     """Also such as kgs does not read: HEIC photos, notes, checkpoints of another program."""
     mine = tmp_path / "project" / name
     mine.parent.mkdir(parents=True)
     mine.write_bytes(b"mine")
-    if name.startswith("sparse"):
-        with pytest.raises(DataError, match="holds files of a scene"):
+    if said:
+        with pytest.raises(DataError, match=said):
             pose_photos(write_planes(folder), tmp_path / "project")
+        assert not found
     else:
         pose_photos(write_planes(folder), tmp_path / "project")
         assert len(list((tmp_path / "project" / "images").glob("*.png"))) == 3
-    assert (tmp_path / "project" / (kept or name) if kept != "refused" else mine).read_bytes() == b"mine"
+    assert mine.read_bytes() == b"mine"
 
 
 @pytest.mark.parametrize("lost", [".kgs.json", ""])
 def test_a_copy_of_the_results_goes_on(folder, tmp_path, found, lost):
-    """Also without hidden files, as `cp OUT/* COPY` makes it."""
+    """Without hidden files, as `cp OUT/* COPY` makes it, nothing in it is known as a file of kgs: it is refused."""
     pose_photos(write_planes(folder), tmp_path / "out")
     copy = tmp_path / "copy"
     shutil.copytree(tmp_path / "out", copy, ignore=shutil.ignore_patterns(lost), copy_function=shutil.copyfile)
+    if lost:
+        with pytest.raises(DataError, match=r"holds photos\.json, images/IMG_1\.png, .*, which this command"):
+            pose_photos(folder, copy)
+        return
     assert pose_photos(folder, copy)["reused"]
     save(folder, planes()[:1, 20:], ["IMG_4.png"])
     assert not pose_photos(folder, copy)["reused"]
     assert len(list((copy / "images").iterdir())) == 4
-    assert (copy / "kept" / "photos.json").exists() == bool(lost)
+
+
+def test_results_that_are_lost_are_made_again_and_changed_ones_refused(folder, tmp_path, found):
+    out = tmp_path / "out"
+    pose_photos(write_planes(folder), out)
+    (out / "sparse" / "0" / "cameras.bin").unlink()
+    assert not pose_photos(folder, out)["reused"]
+    (out / "images" / "IMG_1.png").write_bytes(b"mine")
+    with pytest.raises(DataError, match=r"holds images/IMG_1\.png, which this command did not write"):
+        pose_photos(folder, out)
 
 
 def test_new_cameras_wait_beside_the_fit_of_the_former_ones(folder, found):
     """Until the new fit is there `OUT` has a splat and the cameras that belong to it."""
     out = folder.parent / "out"
-    waiting = out / "unfinished-1"
+    waiting = out / "unfinished"
 
     def published():
         """How many photos the published cameras are of."""
         return (out / "sparse" / "0" / "cameras.bin").read_bytes()[0], len(list((out / "images").iterdir()))
 
-    assert pose_photos(write_planes(folder), out, wait=True)["folder"] == str(out)
+    assert pose_photos(write_planes(folder), out)["folder"] == str(out)
+    assert pose_photos(folder, out, wait=True)["folder"] == str(out)
     assert published() == (3, 3)
-    (out / "checkpoint.safetensors").write_bytes(b"of a fit")
     save(folder, planes()[:1, 20:], ["IMG_4.png"])
     for reused in (False, True):
         report = pose_photos(folder, out, wait=True)
         assert (report["reused"], report["folder"]) == (reused, str(waiting))
         assert len(report["photos"]) == 4
         assert published() == (3, 3)
-    publish(waiting, out, all_former=True)
+    (folder / "IMG_4.png").unlink()
+    assert pose_photos(folder, out, wait=True)["folder"] == str(out)  # those of the fit after all
+    (waiting / "checkpoint.safetensors").write_bytes(b"of a fit to the four")
+    save(folder, planes()[:1, 20:40], ["IMG_5.png"])
+    with pytest.raises(DataError, match="holds a fit that is not done"):
+        pose_photos(folder, out, wait=True)
+    (waiting / "checkpoint.safetensors").unlink()
+    publish(waiting, out)
     assert published() == (4, 4)
     assert not waiting.exists()
-    (folder / "IMG_4.png").unlink()
-    assert pose_photos(folder, out, wait=True)["folder"] == str(waiting)
-    save(folder, planes()[:1, 20:], ["IMG_4.png"])
-    assert pose_photos(folder, out, wait=True)["folder"] == str(out)  # those of the fit after all
-    assert waiting.exists()  # a fit of them may wait, too
-    (folder / "IMG_4.png").unlink()
-    assert pose_photos(folder, out)["folder"] == str(out)
-    assert published() == (3, 3)
-    assert not waiting.exists()
-    assert found == [3, 4, 3]
+    assert found == [3, 4]
 
 
 NOT_FOUND = "kgs: stopped: the cameras were not found yet, and nothing was written\n"

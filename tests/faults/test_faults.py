@@ -21,6 +21,7 @@ if sys.platform != "linux":
 from fits import PATIENCE, Fit, memory_of, start_command
 
 from kgs._support.errors import DataError
+from kgs.app.files.publishing import UNFINISHED, is_own
 from kgs.app.files.results_folder import CHECKPOINT
 from kgs.fit.checkpoint import load_checkpoint, newest_checkpoint
 
@@ -56,7 +57,7 @@ def test_kill_9_at_random_moments(alone: tuple[int, bytes], tmp_path: Path, reco
     steps, expected = alone
     trials, longest = (30, 0.6) if steps == LONG else (1, 0.1)
     fit, moments = Fit(tmp_path, "killed", steps), random.Random(0)
-    path, corrupt, fallen_back, different, fits, kills = fit.out / "unfinished-1" / CHECKPOINT, 0, 0, 0, 0, 0
+    path, corrupt, fallen_back, different, fits, kills = fit.out / UNFINISHED / CHECKPOINT, 0, 0, 0, 0, 0
     while kills < trials:
         process = fit.start()
         if fit.wait_for_steps(process):
@@ -96,7 +97,7 @@ def fitted(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-# A command, and a file that it writes, where a user has put another one; SCENE and OUT are folders.
+# A command, and a file that it writes; SCENE and OUT are folders.
 COMMANDS = {
     "fit": ("fit SCENE -o OUT --steps 12 --init random --init-points 200", "splat.ply"),
     "eval": ("eval OUT", "index.html"),
@@ -114,7 +115,7 @@ COMMANDS = {
 def test_kill_9_of_each_command(
     command: str, folder: Path, fitted: Path, tmp_path: Path, record: Callable[..., None]
 ) -> None:
-    """Killed at a random moment, then run again: what the user wrote is kept, and all results are there."""
+    """Killed at a random moment, then run again: all results are there. And what the user wrote is refused."""
     line, name = COMMANDS[command]
     trials = 30
     moments = random.Random(0)
@@ -125,22 +126,23 @@ def test_kill_9_of_each_command(
         shutil.copytree(fitted, out)
         (out / "more").mkdir()
         words = [word.replace("SCENE", str(folder)).replace("OUT", str(out)) for word in line.split()]
-        mine = out / name
-        mine.write_text("mine")
         start = time.monotonic()
         if trial:  # the first one is left alone
             process = start_command(*words)
             time.sleep(moments.uniform(0.0, seconds))
             process.kill()
             process.join(PATIENCE)
-        kept = mine.parent / "kept" / mine.name if command not in ("fit", "eval") else out / "kept" / name
-        lost += sum(path.exists() and path.read_bytes() == b"mine" for path in (mine, kept)) != 1
-        process = start_command(*words)
+        again = [*words, "--resume"] if command == "fit" and trial else words
+        process = start_command(*again)
         process.join(PATIENCE)
         seconds = seconds or time.monotonic() - start
-        lost += process.exitcode != 0 or kept.read_text() != "mine" or mine.read_bytes() == b"mine"
-        left = [path for path in out.rglob("*") if path.is_dir() and path.name.startswith((".kgs-", "unfinished-"))]
-        lost += any(left) or len(list(mine.parent.glob("kept*"))) != 1
+        lost += process.exitcode != 0 or (not is_own(out, name) and not is_own(out / "more", Path(name).name))
+        lost += any(path.is_dir() and path.name.startswith((".kgs-", UNFINISHED)) for path in out.rglob("*"))
+        if not trial:
+            (out / name).write_text("mine")
+            process = start_command(*words)
+            process.join(PATIENCE)
+            lost += process.exitcode != 2 or (out / name).read_text() != "mine"
         shutil.rmtree(out)
     found = f"{lost} times a file of the user lost, or a result, or a folder left"
     record(f"kill -9 of kgs {command}", trials, lost, found, lost == 0)
@@ -167,7 +169,7 @@ def test_full_disk(alone: tuple[int, bytes], tmp_path: Path, record: Callable[..
     process.join(PATIENCE)
     code = process.exitcode
     try:
-        step = newest_checkpoint(fit.out / "unfinished-1" / CHECKPOINT)[0]["step"]
+        step = newest_checkpoint(fit.out / UNFINISHED / CHECKPOINT)[0]["step"]
     except DataError:
         step = -1
     partial = [path.name for path in fit.out.rglob("*.partial")]

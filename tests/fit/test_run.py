@@ -13,6 +13,7 @@ import pytest
 
 from kgs._support.errors import DataError
 from kgs.app import fit_folder as app
+from kgs.app.files.publishing import UNFINISHED
 from kgs.app.files.results_folder import CHECKPOINT
 from kgs.app.fit_folder import Published, train
 from kgs.app.scene_request import SceneRequest
@@ -136,10 +137,16 @@ def test_checkpoints_are_written_by_the_clock_too(trainer: Trainer, tmp_path: Pa
 
 
 def test_a_damaged_checkpoint_falls_back_and_ends_in_the_same_bits(scene: Any, whole: Path, tmp_path: Path) -> None:
+    """In the folder of results a damaged one is refused first, as any file that is not as it was written."""
     lines: list[str] = []
     shutil.copytree(whole, tmp_path, dirs_exist_ok=True)
     path = tmp_path / CHECKPOINT
     path.write_bytes(path.read_bytes()[:-7])
+    with pytest.raises(DataError, match=f"holds {CHECKPOINT}, which .* was changed since: move it away"):
+        fit_folder(scene, CONFIG, tmp_path, resume=True)
+    (tmp_path / UNFINISHED).mkdir()
+    for part in (path, previous(path)):
+        part.rename(tmp_path / UNFINISHED / part.name)
     fit_folder(scene, CONFIG, tmp_path, resume=True, lines=lines)
     assert any("went on from the previous checkpoint" in line for line in lines)
     assert (tmp_path / "splat.ply").read_bytes() == (whole / "splat.ply").read_bytes()
@@ -150,7 +157,7 @@ def test_a_damaged_checkpoint_falls_back_and_ends_in_the_same_bits(scene: Any, w
     for damaged in (path, previous(path)):
         damaged.write_bytes(b"")
     with pytest.raises(DataError, match=CHECKPOINT):
-        fit_folder(scene, CONFIG, tmp_path, resume=True, lines=lines)
+        Trainer.resume(scene, CONFIG, path)
 
 
 def test_stages_memory_and_what_is_not_resumed_are_told(scene: Any, tmp_path: Path) -> None:

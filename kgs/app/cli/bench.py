@@ -21,7 +21,7 @@ def speed(*, out: Out, quick: bool = False, device: str = "cpu") -> None:
         device: where to render: cpu, cuda, cuda:1, ...
     """
     check_installed("matplotlib")
-    _begin(out, device)
+    _begin(out, "speed", "scaling.png", device=device)
 
     from kgs.app.files.publishing import replacing
     from kgs.bench.speed import speed
@@ -44,7 +44,7 @@ def precision(*, out: Out, quick: bool = False) -> None:
         quick: small images with few Gaussians.
     """
     check_installed("matplotlib")
-    _begin(out)
+    _begin(out, "precision", "render.png", "gradients.png")
 
     from kgs.app.files.publishing import replacing
     from kgs.bench.precision import precision
@@ -65,7 +65,7 @@ def extremes(*, out: Out) -> int:
     Args:
         out: folder for the results, created if it does not exist.
     """
-    _begin(out)
+    _begin(out, "extremes")
 
     from kgs.app.files.publishing import replacing
     from kgs.bench.extremes import extremes
@@ -74,9 +74,11 @@ def extremes(*, out: Out) -> int:
         return extremes(out=new)
 
 
-def _begin(out: Path, device: str = "cpu") -> None:
-    """Check the folder for the results, and load torch."""
+def _begin(out: Path, name: str, *pictures: str, device: str = "cpu") -> None:
+    """Check the folder of a benchmark, which writes three files of its name and pictures; then load torch."""
     from kgs.app.files.outputs import check_folder
+    from kgs.app.files.publishing import check_free
 
     check_folder(out, make=False)
+    check_free(out, f"bench {name}", (f"{name}.csv", f"{name}.json", f"{name}.md", *pictures))
     load_tools(device)

@@ -15,8 +15,13 @@ def check_roll(roll: float) -> None:
         raise ValueError(f"roll: expected degrees in [-360, 360], got {roll}")
 
 
-def check_file(out: Path, ending: str, source: Path | None = None) -> None:
-    """Raise a ValueError or DataError unless a command can write its result to this file, which is not `source`."""
+def check_file(out: Path, ending: str, kind: str, source: Path | None = None) -> None:
+    """Raise a ValueError or DataError unless a command can write its result to this file, which is not `source`.
+
+    `kind` is that of :func:`kgs.app.files.publishing.replacing`.
+    """
+    from kgs.app.files.publishing import check_free
+
     if out.suffix.lower() != ending:
         raise ValueError(f"out: expected a file that ends in {ending}, got {str(out)!r}")
     if out.is_dir():
@@ -25,6 +30,7 @@ def check_file(out: Path, ending: str, source: Path | None = None) -> None:
         raise ValueError(f"out: expected another file than {str(source)!r}, which is read")
     if not out.absolute().parent.is_dir():
         raise DataError(out, "", "expected a file in a folder that is there")
+    check_free(out.parent, kind, [out.name])
 
 
 def check_layout(scene: Path) -> None:
@@ -43,11 +49,12 @@ def check_scene(scene: Path) -> None:
 def check_results(out: Path) -> None:
     """Raise a DataError unless this is the folder of the results of a fit."""
     from kgs._support.json_files import read_json
-    from kgs.app.files.publishing import complete, unpublished
+    from kgs.app.files.publishing import UNFINISHED, complete
+    from kgs.app.files.results_folder import has_fit
 
     complete(out)
     config = out / "config.json"
-    if not config.exists() and unpublished(out, "fit"):
+    if not config.exists() and has_fit(out / UNFINISHED):
         raise DataError(out, "", "holds a fit that is not done: kgs fit --resume goes on with it")
     if not config.exists():
         raise DataError(config, "", "cannot be read: expected the folder of the results of kgs fit")
@@ -83,7 +90,7 @@ def check_photos(
         _check_views(views, hold_out, MAX_FRAMES if frames is None else frames, "frames")
         return
     paths = find_photos(folder)
-    check_workspace(out, folder)
+    check_workspace(out, paths)
     _check_views(views, hold_out, len(paths), "photos")
     if size is None and downscale is None:
         return

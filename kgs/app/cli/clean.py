@@ -57,7 +57,7 @@ def clean(
     from kgs.datasets.options import check_options
 
     check_options(downscale, None)
-    check_file(out, ".ply", splat)
+    check_file(out, ".ply", "clean", splat)
     if cameras is not None:
         check_scene(cameras)
     if splat.is_dir():

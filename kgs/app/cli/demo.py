@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kgs._support.errors import DataError, printable
+from kgs._support.errors import printable
 from kgs.app.console import VIEWER, as_line, each, say, say_next
 from kgs.fit.config import DEMO, DEMO_STEPS, DROP, Backend, FitConfig
 
@@ -45,14 +45,14 @@ def demo(
         backend: auto: the fastest that is installed. kgs fit --help-all describes the others.
     """
     from kgs.app.files.outputs import check_folder
-    from kgs.app.files.publishing import read_marker
+    from kgs.app.files.publishing import check_free
+    from kgs.app.files.results_folder import SPLAT_FILES
 
     config = replace(DEMO, seed=seed, steps=steps, device=device, backend=backend)
     if min(size) < 12:  # the window of SSIM
         raise ValueError(f"size: expected at least 12 pixels a side, got {size[0]} {size[1]}")
     check_folder(out, make=False)
-    if "fit" in read_marker(out):
-        raise DataError(out, "", "holds the results of kgs fit: choose another folder")
+    check_free(out, "demo", (*SPLAT_FILES, "metrics.json", "curve.png", "demo.png"))
     load_tools(device, backend, "jinja2")
 
     from kgs.datasets import synthetic_scene

@@ -29,16 +29,17 @@ def evaluate(
         device: cpu, cuda, ...
         backend: auto: that of the fit. kgs fit --help-all describes the others.
     """
+    from kgs.app.files.publishing import check_free, replacing
     from kgs.metrics.weights import weight_files
 
     if lpips_weights is not None:
         weight_files(lpips_weights)
     check_results(out)
+    check_free(out, "fit", ("metrics.json", "index.html"))
     load_tools(device, backend, "jinja2")
 
     from kgs._support.json_files import read_json, write_json
     from kgs.app.files.locks import locked
-    from kgs.app.files.publishing import replacing
     from kgs.app.page.fit_page import PAGE, write_own_page
     from kgs.app.saved_fit import load_fit
     from kgs.metrics.evaluate import as_text, measure_again

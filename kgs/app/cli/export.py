@@ -32,7 +32,7 @@ def export(
         origin: a point that becomes the origin, x y z: one near the Gaussians of a splat in map coordinates, which
             viewers cannot show there.
     """
-    check_file(out, ".ply", ply)
+    check_file(out, ".ply", "export", ply)
     load_tools()
 
     import torch

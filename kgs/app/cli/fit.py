@@ -4,6 +4,7 @@ import inspect
 import os
 import re
 import warnings
+from contextlib import nullcontext
 from dataclasses import MISSING, field, make_dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -93,7 +94,7 @@ def fit(
             without dropping. See --preset paper --help-all.
         detail: sets size, steps and initial points together. low: 378 pixels. high: 1000 pixels. Options given by name
             win. See --detail high --help-all.
-        resume: continue from the checkpoint in the folder of the results.
+        resume: continue the unfinished fit in the folder of the results, or the finished one.
         title: of the page. Unless given: the name of the folder.
         photos: --no-photos leaves the photos out of the page.
         roll: turn page and film clockwise by so many degrees.
@@ -101,7 +102,10 @@ def fit(
         live: show the splat as it grows on a page on this machine, until the fit ends; a line says its address.
         config: every number of the fit.
     """
+    from kgs.app.files.locks import locked
     from kgs.app.files.outputs import check_folder
+    from kgs.app.files.publishing import UNFINISHED
+    from kgs.app.files.results_folder import check_fit_files
     from kgs.datasets.folders import CAMERAS_REPORT, layout_of
     from kgs.datasets.options import check_options
     from kgs.metrics.weights import weight_files
@@ -116,6 +120,8 @@ def fit(
     if lpips_weights is not None:
         weight_files(lpips_weights)
     check_folder(out, scene, make=False)
+    with locked(out) if (out / UNFINISHED).is_dir() else nullcontext():
+        check_fit_files(out, resume)
     if unposed:
         check_installed("pycolmap")
         pixels = size if isinstance(size, int) else None

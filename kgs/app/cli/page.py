@@ -52,7 +52,7 @@ def page(
 
     check_roll(roll)
     check_options(downscale, None)
-    check_file(out, ".html")
+    check_file(out, ".html", "page")
     check_scene(cameras)
     torch_device = load_tools(device, backend, "jinja2")
 

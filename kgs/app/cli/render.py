@@ -52,7 +52,7 @@ def render(
     import torch
 
     from kgs.app.files.cameras import as_taken
-    from kgs.app.files.publishing import replacing
+    from kgs.app.files.publishing import check_free, replacing
     from kgs.camera import move_camera
     from kgs.renderer import GaussianRenderer
 
@@ -61,6 +61,7 @@ def render(
     fit = load_splat(ply, scene, torch_device, backend)
     renderer = GaussianRenderer(options=fit.options, backend=backend).eval()
     names = png_names(scene.train.names)
+    check_free(out, "renders", names.values())
     color = scene.background.to(torch_device)
     outputs = ("image", "alpha") if is_transparent else ("image",)
     with replacing(out, "renders") as new, torch.no_grad():

@@ -3,7 +3,7 @@
 import math
 from pathlib import Path
 
-from kgs._support.errors import DataError, printable
+from kgs._support.errors import printable
 from kgs.app.console import as_line, say, say_next
 
 from .checks import check_file, check_results
@@ -45,12 +45,12 @@ def scale(splat: Path, /, *, by: tuple[str, str, float], out: Out) -> None:
 def _scale_folder(folder: Path, out: Path, factor: float, length: float) -> None:
     """Write the files of a fit in the new unit; the fit stays as it is."""
     from kgs.app.files.outputs import check_folder
-    from kgs.app.files.publishing import read_marker, replacing
+    from kgs.app.files.publishing import check_free, replacing
+    from kgs.app.files.results_folder import SPLAT_FILES
 
     check_results(folder)
     check_folder(out, make=False)
-    if "fit" in read_marker(out):
-        raise DataError(out, "", "holds the results of kgs fit: choose another folder")
+    check_free(out, "scale", SPLAT_FILES)
     load_tools("cpu", "auto", "jinja2", "safetensors")
 
     from kgs.app.files.exports import write_splat_exports
@@ -71,7 +71,7 @@ def _scale_folder(folder: Path, out: Path, factor: float, length: float) -> None
 
 def _scale_ply(ply: Path, out: Path, factor: float, near: list[float]) -> None:
     """Write a scaled PLY file; positions are read relative to a point near them, because float32 holds few digits."""
-    check_file(out, ".ply", ply)
+    check_file(out, ".ply", "scaled", ply)
     load_tools()
 
     import torch

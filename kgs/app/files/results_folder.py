@@ -1,16 +1,44 @@
-"""The files of a fit, and which of several fits in a folder is the furthest."""
+"""The files of a fit: which names they have, and how far the fit in a folder is."""
 
-from collections.abc import Callable
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
 from kgs._support.errors import DataError
 from kgs._support.json_files import read_json
 
-from .publishing import discard, unpublished
+from .outputs import EXPORTS
+from .publishing import UNFINISHED, check_free, discard
 
 CHECKPOINT = "checkpoint.safetensors"
 PREVIOUS = "checkpoint.previous.safetensors"
+SPLAT_FILES = ("splat.ply", "index.html", *EXPORTS)
+FIT_FILES = (*SPLAT_FILES, "config.json", "metrics.json", "curve.png")
+
+
+def check_fit_files(out: Path, resume: bool, others: Iterable[str] = ()) -> None:
+    """Raise a DataError if a fit would replace files that no fit wrote, or an unfinished fit without `resume`.
+
+    `others` are names of results beside those that each fit writes.
+    """
+    work = out / UNFINISHED
+    names = (*FIT_FILES, *others)
+    is_folder = work.is_dir() and not work.is_symlink()
+    check_free(out, "fit", (*names, CHECKPOINT, PREVIOUS, *([] if is_folder else [UNFINISHED])))
+    check_free(work, "fit", names)
+    if not resume:
+        check_no_fit(work)
+
+
+def check_no_fit(work: Path) -> None:
+    """Raise a DataError if a folder has a fit that is not done."""
+    if has_fit(work):
+        raise DataError(work, "", "holds a fit that is not done: go on with it by --resume, or remove this folder")
+
+
+def has_fit(folder: Path) -> bool:
+    """Whether a fit in this folder can be resumed."""
+    return any((folder / name).exists() for name in (CHECKPOINT, PREVIOUS))
 
 
 def is_finished(out: Path) -> bool:
@@ -33,15 +61,6 @@ def step_of(folder: Path) -> int:
     return max(steps)
 
 
-def resumable_fits(out: Path) -> list[Path]:
-    """The folders of fits in `out` with a checkpoint, `out` included, the furthest first; a finished one only alone."""
-    folders = [*unpublished(out, "fit"), out]
-    found = [folder for folder in folders if any((folder / name).exists() for name in (CHECKPOINT, PREVIOUS))]
-    if len(found) > 1 and found[-1] == out and is_finished(out):
-        found.pop()
-    return sorted(found, key=step_of, reverse=True)
-
-
-def discard_fit(work: Path, say: Callable[[str], None]) -> None:
+def discard_fit(work: Path) -> None:
     """Remove a fit that was not published; files that kgs does not know stay."""
-    discard(work, (CHECKPOINT, PREVIOUS, f"{CHECKPOINT}.partial"), say)
+    discard(work, "fit", (CHECKPOINT, PREVIOUS, f"{CHECKPOINT}.partial"))

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from kgs._support.errors import DataError, listed
-from kgs.app.files.publishing import read_marker
+from kgs.app.files.publishing import MARKER
 from kgs.datasets import folders
 from kgs.datasets.folders import (
     HEIC_SUFFIXES,
@@ -116,7 +116,7 @@ def _inner(folder: Path, masks: Path | None) -> list[str]:
     inner = [path for path in inner if files is None or path not in files.unused]
     notes = files.notes(folder, _LISTED) if files else []
     called = {path for path in inner if path.suffix.lower() in (*IMAGE_SUFFIXES, *UNREADABLE_SUFFIXES)}
-    if deeper := [path for path in inner if path in called or (_holds_photos(path) and not read_marker(path))]:
+    if deeper := [path for path in inner if path in called or (_holds_photos(path) and not (path / MARKER).exists())]:
         notes.append(f"not looked into, because they are folders: {listed_files(deeper)}")
     return notes
 

@@ -21,8 +21,8 @@ from kgs._support.progress import ProgressBar, silent
 from kgs.app.console import say
 from kgs.app.files.locks import locked
 from kgs.app.files.outputs import png_names
-from kgs.app.files.publishing import begin, complete, discard, publish, replacing, unpublished
-from kgs.app.files.results_folder import resumable_fits
+from kgs.app.files.publishing import UNFINISHED, complete, discard, replacing
+from kgs.app.files.results_folder import check_no_fit
 from kgs.datasets.image_file import color_notes
 
 from .agree import agreed_cameras, say_left_out
@@ -72,8 +72,8 @@ def pose_photos(
             `masks`.
         seed: of the solvers. The same photos and seed give the same files, but for the times in photos.json.
         frames: the number of frames that are taken from a video; see :func:`kgs.app.sfm.video.take_frames`.
-        wait: leave new files in a folder of their own in `out` if `out` holds a fit, which belongs to the former
-            cameras.
+        wait: write new files to the folder `unfinished` in `out`, until a fit to them is done: a former one in `out`
+            belongs to the former cameras.
         bar: wraps the loops to show their progress, see :mod:`kgs._support.progress`.
         say: called with each line for the user.
 
@@ -98,7 +98,7 @@ def pose_photos(
     with quiet_pycolmap():  # a missing package is an error before any work
         pass
     paths = find_photos(folder)
-    check_workspace(out, folder)
+    check_workspace(out, paths)
     opened = open_photos(paths, None if masks is None else Path(masks))
     inputs = {
         "settings": SETTINGS,
@@ -108,23 +108,23 @@ def pose_photos(
     }
     out.mkdir(parents=True, exist_ok=True)
     with locked(out):
-        complete(out, say)
-        folders = (*unpublished(out, "photos"), out)
-        posed = next((path for path in folders if is_reusable(path, inputs)), None)
+        complete(out)
+        new_folder = out / UNFINISHED if wait else out
+        posed = next((path for path in (new_folder, out) if is_reusable(path, inputs)), None)
         is_reused = posed is not None
         if posed is None:
-            posed = begin(out, "photos")
+            posed = new_folder
+            if wait:
+                check_no_fit(posed)  # it is one of other cameras
             try:
-                with replacing(posed, "photos") as new:
+                with replacing(posed, "photos", all_former=True) as new:
                     write_json(new / REPORT, inputs | find_cameras(opened, new, seed % 2**31, bar, say))
             except BaseException:
-                discard(posed)
+                if wait:
+                    discard(posed, "photos")
                 raise
         else:
             say(f"cameras: those in {printable(posed)} are of the same {len(paths)} photos and are used again")
-        if posed != out and not (wait and resumable_fits(out)):
-            publish(posed, out, all_former=True, say=say)
-            posed = out
         report = read_json(posed / REPORT)
         if is_reused:
             say_left_out(report.get("left_out", {}), say)
