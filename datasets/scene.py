@@ -76,8 +76,8 @@ class Views:
             raise ValueError(f"cameras: expected {count} as names, got {self.cameras.batch_size}")
         height, width = self.images.shape[-2:]
         if not bool(((self.cameras.height == height) & (self.cameras.width == width)).all()):
-            given = [self.cameras.height.tolist(), self.cameras.width.tolist()]
-            raise ValueError(f"cameras: expected height {height} and width {width} as images, got {given!s:.80}")
+            sizes = [self.cameras.height.tolist(), self.cameras.width.tolist()]
+            raise ValueError(f"cameras: expected height {height} and width {width} as images, got {sizes!s:.80}")
         if self.alphas is not None and tuple(self.alphas.shape) != (count, 1, height, width):
             raise ValueError(f"alphas: expected shape ({count}, 1, {height}, {width}), got {tuple(self.alphas.shape)}")
         if self.border_mask is not None and tuple(self.border_mask.shape) != (height, width):

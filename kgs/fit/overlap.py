@@ -6,7 +6,8 @@ But it blurs, and where most photos show the same surface it gains nothing. The 
 :class:`kgs.init_points.patches.PatchColors`.
 """
 
-from typing import NamedTuple, Self
+from dataclasses import replace
+from typing import Any, NamedTuple, Self
 
 from kgs.init_points import InitialPoints
 from kgs.init_points.patches import MIN_PATCHES, PatchColors
@@ -58,10 +59,17 @@ def decide_by_overlap(plan: Plan, points: InitialPoints) -> Plan:
         usual = {"steps": plan.schedule.steps, "drop": DROP}
         return plan.decided({name: usual[name] for name in is_open})
     overlap = Overlap.of(patches)
-    chosen = {"steps": steps_for(overlap.views_per_patch), "drop": drop_rate_for(overlap.views_per_pair)}
+    chosen: dict[str, Any] = {
+        "steps": steps_for(overlap.views_per_patch),
+        "drop": drop_rate_for(overlap.views_per_pair),
+    }
     entries = {name: chosen[name] for name in is_open}
-    numbers = {name: round(number, 2) for name, number in overlap._asdict().items()}
-    return plan.decided(entries, overlap=OverlapDecision(**numbers, patches=len(patches), **entries))
+    decision = OverlapDecision(
+        views_per_patch=round(overlap.views_per_patch, 2),
+        views_per_pair=round(overlap.views_per_pair, 2),
+        patches=len(patches),
+    )
+    return plan.decided(entries, overlap=replace(decision, **entries))
 
 
 def steps_for(views_per_patch: float) -> int:

@@ -83,7 +83,7 @@ def paired_difference(differences: pd.DataFrame) -> Difference:
     counts = differences.count()  # pairs of each scene
     means = differences.mean()
     k = len(means)
-    mean = float(means.mean())
+    mean = float(means.to_numpy().mean())
     error = float(means.sem())
     noise = noise_floor(differences)
     by_seeds = _half_interval(noise.freedom, noise.sd * math.sqrt((1 / counts).sum()) / max(1, k))

@@ -20,7 +20,7 @@ def counts(values: Iterable[str]) -> str:
 
 def table_of(lines: Iterable[Mapping[str, str]]) -> pd.DataFrame:
     """A table of text, "-" where a line has nothing; columns without anything are left out."""
-    table = pd.DataFrame(lines).fillna("-")
+    table = pd.DataFrame(list(lines)).fillna("-")
     return table.loc[:, (table != "-").any()]
 
 

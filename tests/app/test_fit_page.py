@@ -18,7 +18,7 @@ from factories import random_views
 
 from kgs._support.errors import DataError
 from kgs.app import fit_folder as app
-from kgs.app.cli.evaluate import check_evaluate, evaluate
+from kgs.app.cli.evaluate import evaluate
 from kgs.app.files.publishing import is_own
 from kgs.app.page import fit_page
 from kgs.app.page.fit_page import spread, write_fit_page, write_own_page
@@ -175,9 +175,8 @@ def test_eval_refuses_a_page_that_the_user_changed(done: Path, capsys: Any) -> N
     page = (done / "index.html").read_bytes()
     (done / "index.html").write_text("mine")
     with pytest.raises(DataError, match=r"holds index\.html, which this command did not write"):
-        check_evaluate(done, None, "cpu", "auto")
+        evaluate(done)
     (done / "index.html").write_bytes(page)
-    check_evaluate(done, None, "cpu", "auto")
     evaluate(done)
     assert "LPIPS" not in capsys.readouterr().out
     assert is_own(done, "index.html")
