@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 import pandas as pd
 from scipy import stats
 
@@ -83,8 +84,8 @@ def paired_difference(differences: pd.DataFrame) -> Difference:
     counts = differences.count()  # pairs of each scene
     means = differences.mean()
     k = len(means)
-    mean = float(means.to_numpy().mean())
-    error = float(means.sem())
+    mean = float(means.mean())
+    error = float(np.asarray(means.sem()))
     noise = noise_floor(differences)
     by_seeds = _half_interval(noise.freedom, noise.sd * math.sqrt((1 / counts).sum()) / max(1, k))
     by_scenes = _half_interval(k - 1, error)
