@@ -7,7 +7,6 @@ from torch import Tensor
 from kgs.backends import takes_kernels
 
 MAX_LINE_DISTANCE = 1.5  # pixels, from an epipolar line
-CHUNK = 256  # keypoints matched at once: bounds the memory
 MAX_RATIO = 0.8  # of the best descriptor distance to the second best
 MAX_DISTANCE = 0.4  # between descriptors of length 1, for matches without a second candidate too
 
@@ -36,25 +35,15 @@ def match(
 def _torch_matches(lines: Tensor, pixels: Tensor, descriptors1: Tensor, descriptors2: Tensor) -> tuple[Tensor, ...]:
     """`match` in torch."""
     targets = convert_points_to_homogeneous(pixels).T
-    candidates = [(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64), torch.zeros(0))]
-    for start in range(0, len(lines), CHUNK):
-        rows, columns = ((lines[start : start + CHUNK] @ targets).abs_() < MAX_LINE_DISTANCE).nonzero().unbind(1)
-        # One pair in about a hundred is left: a tenth of the work of all descriptor distances.
-        differences = descriptors1.index_select(0, rows + start) - descriptors2.index_select(0, columns)
-        candidates.append((rows + start, columns, differences.square_().sum(1).sqrt_()))
-    rows, columns, distances = map(torch.cat, zip(*candidates, strict=True))
-    nearest1, rival1 = _nearest(distances, rows, len(lines))
-    nearest2, rival2 = _nearest(distances, columns, len(pixels))
-    good = nearest1 & nearest2 & (distances < MAX_RATIO * torch.minimum(rival1, rival2)) & (distances < MAX_DISTANCE)
-    return distances[good], rows[good], columns[good]
-
-
-def _nearest(distances: Tensor, owners: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """For each candidate: whether it is its owner's nearest, and the distance of its owner's second nearest."""
-    order = torch.arange(len(distances))
-    infinite = distances.new_full((count,), torch.inf)
-    ties = distances == infinite.scatter_reduce(0, owners, distances, "amin")[owners]
-    first = order.new_full((count,), len(order)).scatter_reduce(0, owners[ties], order[ties], "amin")
-    nearest = first[owners] == order
-    rival = infinite.scatter_reduce(0, owners[~nearest], distances[~nearest], "amin")
-    return nearest, rival[owners]
+    distances = descriptors1.new_full((len(lines) + 1, len(pixels) + 1), torch.inf)  # one more: there may be none
+    for row, line in enumerate(lines):
+        columns = ((line @ targets).abs() < MAX_LINE_DISTANCE).nonzero()[:, 0]  # of about one in a hundred
+        distances[row, columns] = (descriptors1[row] - descriptors2[columns]).square().sum(1).sqrt()
+    nearest = distances.argmin(1)
+    rows = (distances.argmin(0)[nearest] == torch.arange(len(nearest))).nonzero()[:, 0]
+    columns = nearest[rows]
+    best = distances[rows, columns]
+    distances[rows, columns] = torch.inf
+    rivals = torch.minimum(distances.amin(1)[rows], distances.amin(0)[columns])
+    good = (best < MAX_RATIO * rivals) & (best < MAX_DISTANCE)
+    return best[good], rows[good], columns[good]

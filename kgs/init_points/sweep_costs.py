@@ -3,8 +3,6 @@
 Source: see `plane_sweep`.
 """
 
-from collections.abc import Iterator
-
 import cv2
 import numpy as np
 import torch
@@ -22,6 +20,8 @@ MIN_JUMP = 1.5 * STEP
 UNSEEN = 0.3  # the score where no neighbour shows the patch; noise reaches as much
 ALONE = 0.6  # the second best score where one neighbour shows it, over that one's
 MARGIN = 1e-3  # pixels by which a point may lie outside an image: rounding of the homography
+# Quarter turns that lead each direction of the smoothing down, and its columns per row, in the order of the kernels
+DIRECTIONS = ((1, 1), (0, 0), (0, 1), (2, 1), (2, 0), (3, 1), (3, 0), (1, 0))
 VARIANCE = 1e-5  # added to that of a patch, in squared grey values, so that noise on flat surfaces does not match
 
 
@@ -43,7 +43,8 @@ def sweep_costs(
     if takes_kernels(backend, "sweep", image):
         memory = torch.empty(2, *image.shape, homographies.shape[1]) if memory is None else memory
         return _compiled_costs(image, others, homographies, *memory)
-    costs = 1.0 - _combine(_scores(image, other, turns) for other, turns in zip(others, homographies, strict=True))
+    moments = _moments(image)
+    costs = torch.stack([_plane_costs(image, moments, others, plane) for plane in homographies.unbind(1)])
     return _semi_global(costs, image), costs
 
 
@@ -65,17 +66,27 @@ def _compiled_costs(
     return smoothed.permute(2, 0, 1), costs.permute(2, 0, 1)
 
 
-def _scores(image: Tensor, target: Tensor, homographies: Tensor) -> Tensor:
-    """NCC of the patches of each plane and pixel, `(D, H, W)`; -inf where the patch leaves the other image."""
-    mean, variance = _moments(image)
-    scores = torch.empty(len(homographies), *image.shape)
-    for plane, homography in enumerate(homographies):
-        warped, inside = warp(target, homography)
-        warped_mean, warped_variance = _moments(warped)
-        inverse_deviation = ((variance + VARIANCE) * (warped_variance + VARIANCE)).rsqrt()
-        score = (_box(image.double() * warped) - mean * warped_mean) * inverse_deviation
-        scores[plane] = torch.where(_box(inside.float()) > 0.99, score, -torch.inf)
-    return scores
+def _plane_costs(image: Tensor, moments: tuple[Tensor, Tensor], others: Tensor, homographies: Tensor) -> Tensor:
+    """1 minus the scores of the pixels on one plane, `(H, W)`.
+
+    Three quarters of the best neighbour's score and a quarter of the second best's: others may not see the patch.
+    """
+    pairs = zip(others, homographies, strict=True)
+    scores = torch.stack([_correlations(image, moments, *pair) for pair in pairs]).sort(0, descending=True).values
+    best = scores[0]
+    if len(scores) > 1:
+        best = 0.75 * best + 0.25 * torch.where(scores[1] > -torch.inf, scores[1], ALONE * best)
+    return 1.0 - torch.where(best > -torch.inf, best, UNSEEN)
+
+
+def _correlations(image: Tensor, moments: tuple[Tensor, Tensor], other: Tensor, homography: Tensor) -> Tensor:
+    """NCC of the patch around each pixel, `(H, W)`; -inf where the patch leaves the other image."""
+    mean, variance = moments
+    warped, inside = warp(other, homography)
+    warped_mean, warped_variance = _moments(warped)
+    covariance = _box(image.double() * warped) - mean * warped_mean
+    scores = covariance * ((variance + VARIANCE) * (warped_variance + VARIANCE)).rsqrt()
+    return torch.where(_box(inside.float()) > 0.99, scores, -torch.inf).float()
 
 
 def warp(image: Tensor, homography: Tensor) -> tuple[Tensor, Tensor]:
@@ -105,47 +116,24 @@ def _moments(image: Tensor) -> tuple[Tensor, Tensor]:
     return mean, (_box(image * image) - mean * mean).clamp_min(0.0)
 
 
-def _combine(scores: Iterator[Tensor]) -> Tensor:
-    """Three quarters of the best neighbour's score and a quarter of the second best's: others may not see the patch."""
-    best = next(scores)
-    second = None
-    for score in scores:
-        lower = torch.minimum(best, score)
-        best = torch.maximum(best, score)
-        second = lower if second is None else torch.maximum(second, lower)
-    if second is not None:
-        best = 0.75 * best + 0.25 * torch.where(second > -torch.inf, second, ALONE * best)
-    return torch.where(best > -torch.inf, best, UNSEEN)
-
-
 def _semi_global(cost: Tensor, grey: Tensor) -> Tensor:
     """The sum of the costs of the cheapest paths along eight directions, `(D, H, W)`."""
     total = torch.zeros_like(cost)
-    for volume, image, result in ((cost, grey, total), (cost.mT, grey.mT, total.mT)):
-        for flip in (False, True):
-            for slant in (-1, 0, 1) if volume is cost else (0,):  # diagonals once
-                _add_paths(volume, image, result, flip, slant)
+    for turns, slant in DIRECTIONS:
+        total += _path_costs(cost.rot90(turns, (1, 2)), grey.rot90(turns), slant).rot90(-turns, (1, 2))
     return total
 
 
-def _add_paths(cost: Tensor, grey: Tensor, total: Tensor, flip: bool, slant: int) -> None:
-    """Add the costs of the cheapest paths that come down row by row, `slant` columns to the right per row."""
-    rows = range(cost.shape[1])
-    before = torch.empty(0)
-    last = -1
-    for row in reversed(rows) if flip else rows:
-        path = cost[:, row].clone()
-        if last >= 0:
-            previous = before.roll(slant, 1)
-            edge = (grey[row] - grey[last].roll(slant)).abs()
-            cheapest_before = previous.amin(0)
-            cheapest = torch.minimum(previous, cheapest_before + (JUMP * EDGE / (EDGE + edge)).clamp_min(MIN_JUMP))
-            cheapest[1:] = torch.minimum(cheapest[1:], previous[:-1] + STEP)
-            cheapest[:-1] = torch.minimum(cheapest[:-1], previous[1:] + STEP)
-            more = cheapest - cheapest_before
-            if slant:
-                more[:, 0 if slant > 0 else -1] = 0.0  # paths begin at the border
-            path += more
-        total[:, row] += path
-        before = path
-        last = row
+def _path_costs(cost: Tensor, grey: Tensor, slant: int) -> Tensor:
+    """Costs of the cheapest paths that come down row by row, `slant` columns to the right per row, `(D, H, W)`."""
+    paths = cost.clone()
+    end = cost.shape[2] - slant
+    for row in range(1, cost.shape[1]):  # of the first row, and at the side, paths begin
+        before = paths[:, row - 1, :end]
+        lowest = before.amin(0)
+        edge = (grey[row, slant:] - grey[row - 1, :end]).abs()
+        cheapest = torch.minimum(before, lowest + (JUMP * EDGE / (EDGE + edge)).clamp_min(MIN_JUMP))
+        cheapest[1:] = torch.minimum(cheapest[1:], before[:-1] + STEP)
+        cheapest[:-1] = torch.minimum(cheapest[:-1], before[1:] + STEP)
+        paths[:, row, slant:] += cheapest - lowest
+    return paths
