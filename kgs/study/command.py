@@ -141,11 +141,14 @@ def check_study(
     """Check the arguments of `kgs study`."""
     from kgs.app.cli.checks import check_installed
     from kgs.app.files.outputs import check_folder
+    from kgs.app.files.publishing import check_free
     from kgs.fit.config import FitConfig
     from kgs.metrics.weights import weight_files
 
     check_installed("cpu", "auto", "pandas", "scipy", "distributed", "matplotlib", "jinja2")
     check_folder(out, make=False)
+    reports = {"guard": ("guard.md", "guard.jsonl"), "beyond": ("beyond.md",)}
+    check_free(out, "study", reports.get(preset, ("sparse.csv", "sparse.md", "index.html")))
     if table is not None and preset != "paper":
         raise ValueError(f"table: expected the preset 'paper', which has the tables, got {preset!r}")
     FitConfig(steps=steps)

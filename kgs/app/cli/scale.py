@@ -89,7 +89,6 @@ def check_scale(splat: Path, by: tuple[str, str, float], out: Path, **_: Any) ->
     """Check the arguments of `kgs scale`."""
     from kgs.app.files.outputs import check_folder
     from kgs.app.files.publishing import check_free
-    from kgs.app.files.results_folder import SPLAT_FILES
 
     from .checks import check_file, check_installed, check_results
 
@@ -103,7 +102,7 @@ def check_scale(splat: Path, by: tuple[str, str, float], out: Path, **_: Any) ->
         check_installed("cpu", "auto", "jinja2", "safetensors")
         check_results(splat)
         check_folder(out, make=False)
-        check_free(out, "scale", SPLAT_FILES)
+        check_free(out, "scale", ("splat.ply", "splat.compressed.ply", "splat.glb", "cameras.json", "index.html"))
         return
     check_installed("cpu", "auto")
     check_file(out, ".ply", "scaled", splat)
