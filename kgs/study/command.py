@@ -72,10 +72,12 @@ def study(
         ValueError: the preset has no such fits, `table` is not of this preset, or `steps` is out of its range.
     """
     from kgs.app.files.outputs import check_folder
-    from kgs.app.files.publishing import replacing
+    from kgs.app.files.publishing import check_free, replacing
     from kgs.metrics.weights import weight_files
 
     check_folder(out, make=False)
+    reports = {"guard": ("guard.md", "guard.jsonl"), "beyond": ("beyond.md",)}
+    check_free(out, "study", reports.get(preset, ("sparse.csv", "sparse.md", "index.html")))
     if table is not None and preset != "paper":
         raise ValueError(f"table: expected the preset 'paper', which has the tables, got {preset!r}")
     FitConfig(steps=steps)

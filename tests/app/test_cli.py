@@ -21,8 +21,9 @@ from kgs._support.json_files import write_json
 from kgs.app.cli.fit import first_config
 from kgs.app.cli.run import COMMANDS, load_command
 from kgs.app.cli.tools import explain_import_error, load_package, load_tools
+from kgs.app.files.locks import locked
 from kgs.app.files.outputs import EXPORTS, FILMS
-from kgs.app.files.publishing import replacing
+from kgs.app.files.publishing import UNFINISHED, replacing
 from kgs.app.files.results_folder import CHECKPOINT, PREVIOUS
 from kgs.fit.config import DETAILS, DROP, PAPER, PRESETS, FitConfig
 
@@ -130,6 +131,16 @@ def test_resume_of_a_finished_fit_changes_nothing_and_with_other_numbers_is_refu
     assert run("fit", folder, "-o", fitted, "--steps", STEPS, "--seed", 1, *FIT, "--resume") == 2
     assert "--seed: expected 0" in one_line(capsys)
     assert (fitted / "splat.ply").read_bytes() == before
+
+
+def test_a_fit_at_work_is_not_called_unfinished(folder, tmp_path, capsys):
+    (tmp_path / UNFINISHED).mkdir()
+    (tmp_path / UNFINISHED / CHECKPOINT).touch()
+    with locked(tmp_path):
+        assert run("fit", folder, "-o", tmp_path) == 2
+        assert "another fit is at work" in one_line(capsys)
+    assert run("fit", folder, "-o", tmp_path) == 2
+    assert "go on with it by --resume, or remove this folder" in one_line(capsys)
 
 
 @pytest.fixture(scope="module")

@@ -173,6 +173,8 @@ def test_what_the_user_writes_meanwhile_is_refused_and_the_new_results_wait(out:
         write(new, NEW)
         write(out, mine)
     for _ in range(2):
+        with pytest.raises(DataError, match=r"the new results wait in \.kgs-\w+, and the next command here then"):
+            check_free(out, "demo", NEW)
         now = contents(out)
         assert {name: now[name] for name in OLD | mine} == OLD | mine
         with refused("b.txt", "test/0.txt"):

@@ -188,7 +188,9 @@ def _move(work: Path, out: Path) -> None:
         for name, sha in files.items()
         if (work / name).is_file()
     }
-    _check_free(out, own)
+    _check_free(
+        out, own, f"the new results wait in {work.name}, and the next command here then replaces the former ones"
+    )
     for name in own:
         (out / name).parent.mkdir(parents=True, exist_ok=True)
         os.replace(work / name, out / name)
@@ -206,13 +208,13 @@ def _move(work: Path, out: Path) -> None:
         _remove_marker(work)
 
 
-def _check_free(out: Path, own: dict[str, list[str | None]]) -> None:
+def _check_free(out: Path, own: dict[str, list[str | None]], advice: str = "or choose another folder") -> None:
     """Raise a DataError if something in `out` has one of these names and none of its SHA-256."""
     blocked = [path for name, shas in own.items() if (path := _in_the_way(out, name, shas)) is not None]
     if blocked:
         names = listed([path.relative_to(out).as_posix() for path in dict.fromkeys(blocked)], _MAX_NAMED)
         reason = f"holds {names}, which this command did not write, or which was changed since"
-        raise DataError(out, "", f"{reason}: move it away, or choose another folder")
+        raise DataError(out, "", f"{reason}: move it away, {advice}")
 
 
 def _in_the_way(folder: Path, name: str, own: Iterable[str | None]) -> Path | None:
