@@ -4,7 +4,6 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
 import pandas as pd
 from scipy import stats
 
@@ -85,7 +84,7 @@ def paired_difference(differences: pd.DataFrame) -> Difference:
     means = differences.mean()
     k = len(means)
     mean = float(means.mean())
-    error = float(np.asarray(means.sem()))
+    error = float(means.std()) / math.sqrt(max(1, k))
     noise = noise_floor(differences)
     by_seeds = _half_interval(noise.freedom, noise.sd * math.sqrt((1 / counts).sum()) / max(1, k))
     by_scenes = _half_interval(k - 1, error)

@@ -1,7 +1,7 @@
 """Numbers, tables and reports of the study as text."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import pandas as pd
 
@@ -18,7 +18,7 @@ def counts(values: Iterable[str]) -> str:
     return "; ".join(f"{count} {value}" for value, count in Counter(values).most_common())
 
 
-def table_of(lines: Iterable[Mapping[str, str]]) -> pd.DataFrame:
+def table_of(lines: Sequence[Mapping[str, str]]) -> pd.DataFrame:
     """A table of text, "-" where a line has nothing; columns without anything are left out."""
     table = pd.DataFrame(list(lines)).fillna("-")
     return table.loc[:, (table != "-").any()]
