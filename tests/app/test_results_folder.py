@@ -409,7 +409,7 @@ def test_a_fit_is_done_after_the_steps_that_the_photos_decided(
     scene: Any, done: Path, monkeypatch: Any, decided: int, interrupted: bool
 ) -> None:
     """Not after those of the plan before, which are 3."""
-    monkeypatch.setattr(app, "decide", lambda plan, _: plan.decided({"steps": decided}, {}))
+    monkeypatch.setattr(app, "decide", lambda plan, _: plan.decided({"steps": decided}))
     if interrupted:
         interrupt_at(3, monkeypatch)
     fit(scene, OTHER, done)
