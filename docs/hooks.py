@@ -15,7 +15,7 @@ from mkdocs.structure.files import File
 ROOT = Path(__file__).parents[1]
 PAGES = {"README.md": "index.md", "CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md"}
 PACKAGES = {"kgs": "kgs", "losses": "kgs/losses", "datasets": "kgs/datasets"}
-FRAME = '<iframe src="banana.html" title="The page of a fit" loading="lazy"></iframe>'
+FRAME = '<iframe src="demo.html" title="The page of a fit" loading="lazy"></iframe>'
 _installed = tempfile.TemporaryDirectory()
 
 
@@ -50,7 +50,7 @@ def on_files(files, config):
 def on_page_markdown(markdown, page, config, files):
     """Gives wide tables of results the whole width and links to notebooks their place; the first page has a viewer."""
     if page.file.src_uri == "index.md":
-        markdown = re.sub(r"!\[the page of a fit\]\(page\.jpg\)", FRAME, markdown)
+        markdown = re.sub(r"!\[the page of the demo\]\(pictures/page\.jpg\)", FRAME, markdown)
     if page.file.src_uri.startswith("results/"):
         page.meta["hide"] = ["toc"]
     return markdown.replace("](../notebooks/", "](notebooks/").replace("](../README.md", "](index.md")

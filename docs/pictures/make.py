@@ -1,4 +1,7 @@
-"""Draws the pictures of the guide from the splat of `kgs demo`: python docs/pictures/make.py DEMO/splat.ply."""
+"""Draws the pictures of the guide from the splat of `kgs demo --scene room`.
+
+python docs/pictures/make.py ROOM/splat.ply
+"""
 
 import sys
 from pathlib import Path
@@ -20,7 +23,7 @@ FOLDER = Path(__file__).parent
 
 def main(ply: str) -> None:
     """Draw all pictures."""
-    scene = synthetic_scene("room", train_views=3, test_views=3, size=(HEIGHT, WIDTH))
+    scene = synthetic_scene(train_views=3, test_views=3, size=(HEIGHT, WIDTH))
     splat = kgs.load_ply(ply, origin=scene.offset)
     with torch.no_grad():
         gaussians = splat()

@@ -282,6 +282,7 @@ DETAILS = {
     "high": Detail(1000, {"coarse": 0.5, "init_points": 90_000}),
 }
 COARSE = 0.5  # of unposed photos at the size of normal detail
-# A fit, its page and its film within a minute on two cores.
+# A fit, its page and its film in half a minute on two cores: of the photos of `kgs demo`, and of its room.
 DEMO_STEPS = 350
-DEMO = FitConfig(steps=DEMO_STEPS, coarse=0.3, init_points=12_000, max_gaussians=16_000, evaluations=4)
+DEMO = FitConfig(steps=DEMO_STEPS, coarse=0.7, init_points=30_000, max_gaussians=30_000, evaluations=4)
+ROOM_DEMO = replace(DEMO, coarse=0.3, init_points=12_000, max_gaussians=16_000)

@@ -213,28 +213,6 @@ def test_a_newline_in_a_folders_name_is_escaped(tmp_path, capsys):
     assert r"a\nb" in one_line(capsys)
 
 
-def test_demo_fits_with_dropping(tmp_path, capsys):
-    assert run("demo", "-o", tmp_path, "--steps", 2, "--size", 32, 40) == 0
-    metrics = json.loads((tmp_path / "metrics.json").read_text())
-    assert set(metrics) == {"with"}
-    assert "difference on test views" not in capsys.readouterr().out
-    assert {"index.html", "demo.png", "curve.png", "splat.ply"} <= set(os.listdir(tmp_path))
-
-
-@pytest.mark.slow
-def test_demo_compares_at_equal_starts(tmp_path, capsys):
-    assert run("demo", "-o", tmp_path, "--steps", 12, "--size", 32, 40, "--compare") == 0
-    runs = json.loads((tmp_path / "metrics.json").read_text())
-    assert set(runs) == {"without", "with"}
-    assert (runs["without"]["drop"], runs["with"]["drop"]) == (0.0, DROP)
-    assert runs["without"]["init"] == runs["with"]["init"]
-    gain = runs["with"]["test"]["psnr"] - runs["without"]["test"]["psnr"]
-    assert f"{gain:+.2f} dB" in capsys.readouterr().out
-    assert cv2.imread(str(tmp_path / "demo.png")) is not None
-    assert cv2.imread(str(tmp_path / "curve.png")) is not None
-    assert len(kgs.load_ply(tmp_path / "splat.ply")) == runs["with"]["gaussians"]
-
-
 def test_presets_and_details_are_starts_that_options_change(folder, tmp_path, monkeypatch):
     seen = []
 

@@ -265,7 +265,7 @@ def test_the_readme_of_a_published_package_links_to_the_repository(tmp_path):
     made = re.findall(r"https://github.com/OWNER/kgs/(raw|blob)/v[\d.]+/([^)#]+)", after)
     assert sorted(path for _, path in made) == sorted(link.partition("#")[0] for link in links(before))
     shown = {path for kind, path in made if kind == "raw"}  # what a browser has to show as it is
-    assert shown == {path for _, path in made if path.endswith((".jpg", ".png", ".html"))} > {"docs/demo.png"}
+    assert shown == {path for _, path in made if path.endswith((".jpg", ".png", ".html"))} > {"docs/demo.html"}
     assert re.sub(r"https://github.com/OWNER/kgs/(raw|blob)/v[\d.]+/", "", after) == before
 
 

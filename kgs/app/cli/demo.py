@@ -1,13 +1,14 @@
-"""`kgs demo`: fits the built-in scene with DropGaussian, and to compare without it from the same initial points."""
+"""`kgs demo`: fits a built-in scene with DropGaussian, and to compare without it from the same initial points."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from kgs._support.errors import printable
 from kgs.app.console import VIEWER, as_line, each, say, say_next
-from kgs.fit.config import DEMO, DEMO_STEPS, DROP, Backend, FitConfig
+from kgs.fit.config import DEMO, DEMO_STEPS, DROP, ROOM_DEMO, Backend, FitConfig
 
 from .options import Out
 from .tools import load_tools
@@ -16,10 +17,16 @@ if TYPE_CHECKING:
     from kgs.datasets.scene import Scene
     from kgs.fit.fit import Fit
 
+PHOTOS = Path(__file__).parents[1] / "demo_photos"  # six training photos, two held out, and their cameras
+PHOTO_SIZE = 335, 504  # their height and width
+CREDIT = "Photos: Piero Toffanin, dataset_banana (MIT licence)."
+MIN_SIDE = 12  # pixels: the window of SSIM
+
 
 def demo(
     *,
     out: Out = Path("demo"),
+    scene: Literal["bananas", "room"] = "bananas",
     steps: int = DEMO_STEPS,
     size: tuple[int, int] = (378, 504),
     compare: bool = False,
@@ -27,7 +34,7 @@ def demo(
     device: str = "cpu",
     backend: Backend = "auto",
 ) -> None:
-    """Fit three photos of a built-in room, and measure the fit on three held-out views.
+    """Fit six photos of bananas, and measure the fit on two held-out photos.
 
     For example:
       kgs demo -o demo
@@ -36,11 +43,13 @@ def demo(
     Args:
         out: folder for index.html, demo.png, curve.png, metrics.json, splat.ply, .compressed.ply and .glb, cameras.json
             and turntable.webm (.mp4 where there is an encoder).
+        scene: bananas: photos by Piero Toffanin (dataset_banana, MIT licence), whose cameras were found from all eight.
+            room: a synthetic one, three training and three held-out views.
         steps: training steps; all of the demo takes half a minute on 2 cores with the default.
-        size: height and width of the pictures.
+        size: height and width of the pictures; photos are reduced until they fit in, and never enlarged.
         compare: fit a second time without DropGaussian, from the same initial points. For most seeds the two differ
             little.
-        seed: of everything random: the scene, the initial points and the fits.
+        seed: of everything random: the room, the initial points and the fits.
         device: cpu, cuda, ...
         backend: auto: the fastest that is installed. kgs fit --help-all describes the others.
     """
@@ -48,17 +57,16 @@ def demo(
     from kgs.app.files.publishing import check_free
     from kgs.app.files.results_folder import SPLAT_FILES
 
-    config = replace(DEMO, seed=seed, steps=steps, device=device, backend=backend)
-    if min(size) < 12:  # the window of SSIM
-        raise ValueError(f"size: expected at least 12 pixels a side, got {size[0]} {size[1]}")
+    preset = ROOM_DEMO if scene == "room" else DEMO
+    config = replace(preset, seed=seed, steps=steps, device=device, backend=backend)
+    check_size(scene, size)
     check_folder(out, make=False)
     check_free(out, "demo", (*SPLAT_FILES, "metrics.json", "curve.png", "demo.png"))
     load_tools(device, backend, "jinja2")
 
-    from kgs.datasets import synthetic_scene
-
-    scene = synthetic_scene("room", train_views=3, test_views=3, size=size, seed=seed)
-    runs = run_demo(scene, config, out, {"without": 0.0, "with": DROP} if compare else {"with": DROP})
+    drops = {"without": 0.0, "with": DROP} if compare else {"with": DROP}
+    notes = [CREDIT] if scene == "bananas" else []
+    runs = run_demo(load_demo(scene, size, seed), config, out, drops, notes)
     say(f"\n{'':22}{'PSNR':>8}{'SSIM':>8}{'train PSNR':>12}{'Gaussians':>11}{'seconds':>9}")
     level = {name: [_level(run[part]) for part in ("test", "train")] for name, run in runs.items()}
     for name, run in runs.items():
@@ -67,6 +75,8 @@ def demo(
     if compare:
         gain = level["with"][0] - level["without"][0]
         say(f"\ndifference on test views: {gain:+.2f} dB of one seed; seeds differ by more (try --seed 1, 2, ...)")
+    for note in notes:
+        say(note)
     say(f"pictures: {printable(out / 'demo.png')}, {printable(out / 'curve.png')}")
     say_next(
         f"open {as_line(out / 'index.html')} in a browser",
@@ -75,10 +85,40 @@ def demo(
     )
 
 
-def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, float]) -> dict[str, dict[str, Any]]:
+def load_demo(name: str, size: tuple[int, int], seed: int) -> "Scene":
+    """The bananas or the room, in pictures of at most this height and width."""
+    from kgs.datasets import load_scene, synthetic_scene
+
+    if name == "room":
+        return synthetic_scene(train_views=3, test_views=3, size=size, seed=seed)
+    return load_scene(PHOTOS, downscale=_reduction(size))
+
+
+def check_size(scene: str, size: tuple[int, int]) -> None:
+    """Raise a ValueError where pictures of this size would be too small for the SSIM."""
+    if min(size) < MIN_SIDE:
+        raise ValueError(f"size: expected at least {MIN_SIDE} pixels a side, got {size[0]} {size[1]}")
+    if scene == "bananas" and min(PHOTO_SIZE) / _reduction(size) < MIN_SIDE:
+        min_width = math.ceil(MIN_SIDE * PHOTO_SIZE[1] / PHOTO_SIZE[0])
+        raise ValueError(f"size: expected at least {MIN_SIDE} {min_width} for these photos, got {size[0]} {size[1]}")
+
+
+def _reduction(size: tuple[int, int]) -> float:
+    """The factor by which the photos are reduced to fit into this height and width."""
+    return max(1.0, PHOTO_SIZE[0] / size[0], PHOTO_SIZE[1] / size[1])
+
+
+def run_demo(
+    scene: "Scene", config: FitConfig, out: Path, drops: dict[str, float], notes: Sequence[str] = ()
+) -> dict[str, dict[str, Any]]:
     """Fit a scene once or twice, and write pictures, page and all other files; returns the content of metrics.json.
 
-    `drops` are the rates of dropping by the name of the run; pictures show the last one beside the others.
+    Args:
+        scene: with test views.
+        config: of all fits, but for `drop`.
+        out: folder of the files.
+        drops: rates of dropping by the name of the run; pictures show the last one beside the others.
+        notes: sentences for the page.
     """
     from kgs._support.json_files import write_json
     from kgs.app.files.exports import write_exports
@@ -112,6 +152,7 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, floa
     worst = sorted(range(len(levels)), key=levels.__getitem__)[:2]
     cameras = [scene.test.camera(i) for i in range(len(scene.test))]
     renders = {title: [one.render(camera)[0] for camera in cameras] for title, one in fits.items()}
+    shown = [f"The viewer and the sliders show the fit {title}."] if len(runs) > 1 else []
     with replacing(out, "demo", all_former=True) as new:
         save_ply(new / "splat.ply", fit.model, offset=scene.offset)
         for note in write_exports(fit, new):
@@ -123,7 +164,7 @@ def run_demo(scene: "Scene", config: FitConfig, out: Path, drops: dict[str, floa
             new / PAGE,
             "kgs demo",
             fits,
-            notes=[f"The viewer and the sliders show the fit {title}."] if len(runs) > 1 else [],
+            notes=[*shown, *notes],
         )
     return runs
 
