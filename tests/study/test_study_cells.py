@@ -120,7 +120,9 @@ def test_methods_of_one_start_follow_each_other(data):
 
 
 @pytest.mark.slow
-def test_a_cell_measures_and_repeats_bit_for_bit():
+def test_a_cell_measures_and_repeats_bit_for_bit(monkeypatch):
+    asked = []
+    monkeypatch.setattr(cells_module, "revision", asked.append)
     results = [sparse_cell(tiny_cell("progressive 0.2")) for _ in range(2)]
     for result in results:
         json.dumps(result, allow_nan=False)
@@ -135,6 +137,7 @@ def test_a_cell_measures_and_repeats_bit_for_bit():
             result.pop(key)
         result["init"].pop("seconds")
     assert results[0] == results[1]
+    assert {path.name for path in asked} == {"kgs"}  # the commit is that of the whole package
 
 
 @pytest.mark.slow
