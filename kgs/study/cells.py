@@ -10,7 +10,6 @@ from typing import Any
 
 import torch
 
-import kgs
 from kgs._support.errors import DataError
 from kgs._support.machine import peak_rss_mb, revision
 from kgs.app.page.pictures import Picture, encoded
@@ -104,7 +103,7 @@ def fit_and_measure(
         "wall_seconds": fit.history["seconds"],
         "peak_rss_mb": peak_rss_mb(),
         "versions": fit.metrics["versions"],
-        "revision": revision(Path(kgs.__file__).parent),
+        "revision": revision(Path(__file__).parents[1]),
         "date": datetime.now(UTC).date().isoformat(),
     }
     return trainer, fit, stored
