@@ -139,7 +139,6 @@ def fit(
     from kgs.app.stages import Stages
     from kgs.datasets import load_scene
     from kgs.datasets.field import field_size
-    from kgs.fit.decisions import Decisions
     from kgs.fit.prune import left_out
     from kgs.init_points.files import read_points
     from kgs.metrics.evaluate import as_text
@@ -204,7 +203,7 @@ def fit(
     shrink = request.shrink(base, loaded)
     shrunk = ("--downscale", f"{shrink:g}") if shrink > 1.0 else ()
     say(f"{printable(splat)}: {metrics['gaussians']} Gaussians after {metrics['steps']} steps")
-    if needless := left_out(Decisions.from_dict(metrics["decisions"])):
+    if needless := left_out(published.fit.decisions):
         say(f"left out: {needless}")
     if published.signal:
         say_next("the same command with --resume goes on where it stopped")

@@ -44,12 +44,12 @@ def scale(splat: Path, /, *, by: tuple[str, str, float], out: Out) -> None:
 
 def _scale_folder(folder: Path, out: Path, factor: float, length: float) -> None:
     """Write the files of a fit in the new unit; the fit stays as it is."""
-    from kgs.app.files.outputs import check_folder
+    from kgs.app.files.outputs import SPLAT_EXPORTS, check_folder
     from kgs.app.files.publishing import check_free, replacing
 
     check_results(folder)
     check_folder(out, make=False)
-    check_free(out, "scale", ("splat.ply", "splat.compressed.ply", "splat.glb", "cameras.json", "index.html"))
+    check_free(out, "scale", ("splat.ply", "index.html", *SPLAT_EXPORTS))
     load_tools("cpu", "auto", "jinja2", "safetensors")
 
     from kgs.app.files.exports import write_splat_exports

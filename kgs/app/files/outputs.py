@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 FILMS = ("turntable.mp4", "turntable.webm")  # a fit writes one of them
-# for other programs, and for messengers
-EXPORTS = ("cameras.json", "splat.compressed.ply", "splat.glb", "preview.jpg", *FILMS)
+SPLAT_EXPORTS = ("cameras.json", "splat.compressed.ply", "splat.glb")  # for other programs
+EXPORTS = (*SPLAT_EXPORTS, "preview.jpg", *FILMS)  # and for messengers
 _SCENES = ("sparse", *LAYOUT_FILES.values())
 _ENDING = r"(?<=[^./\\])\.[^./\\]*$"  # of a view's name; the name of a hidden file is no ending
 _LONGEST = 120  # bytes of a picture's name
