@@ -74,9 +74,9 @@ def find_mask_files(photos: Sequence[Path], root: Path, folder: Path | None = No
         masks, others = _pictures(searched_folder, own)
         if folder is not None and not masks:
             raise DataError(folder, "", "expected masks, pictures with the stems of the photos, found none")
-        found, unfit = _of_folder(searched_folder, masks, own, on_disk, is_strict)
+        found, rejected = _of_folder(searched_folder, masks, own, on_disk, is_strict)
         is_strict = is_strict and not masks
-        unused += [*others, *unfit, *(mask for photo, mask in found.items() if photo in keeping)]
+        unused += [*others, *rejected, *(mask for photo, mask in found.items() if photo in keeping)]
         keeping = found | keeping
     beside = _beside(photos, parents)
     unused += [mask for photo, mask in beside.items() if photo in keeping]
@@ -120,7 +120,7 @@ def _of_folder(
     """The masks of a folder by their photos, and those that fit none of the files on disk, several, or one twice."""
     by_name = _by_name(photos)
     found = dict[Path, Path]()
-    unfit = list[Path]()
+    rejected = list[Path]()
     for mask in masks:
         fitting = _fitting(mask, by_name, folder)
         reason = ""
@@ -135,8 +135,8 @@ def _of_folder(
         if reason and is_strict:
             raise DataError(mask, "", reason)
         if reason:
-            unfit.append(mask)
-    return found, unfit
+            rejected.append(mask)
+    return found, rejected
 
 
 def _by_name(photos: Iterable[Path]) -> dict[str, list[Path]]:

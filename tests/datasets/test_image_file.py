@@ -312,7 +312,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int, i
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="resident memory is measured on Linux")
 @pytest.mark.parametrize("name", IMAGES)
-def test_reading_an_image_takes_the_memory_that_is_foretold(
+def test_reading_an_image_takes_the_memory_that_is_estimated(
     name: str, measured: dict[str, tuple[int, int, int]]
 ) -> None:
     """At most 24 bytes per pixel, the file, and a few MiB for the decoder; docs/stiff-cases.md says so."""

@@ -183,7 +183,7 @@ def test_memory_over_many_steps(tmp_path: Path, record_property: Callable[[str, 
     steps = 2000
     slope, peak, ceiling = memory_of(tmp_path, steps)
     growth = f"grows by {slope:+.2f} KiB per step over the second half"
-    maximum = f"at most {peak / 2**20:.0f} MiB over the start, {ceiling / 2**20:.0f} MiB foretold"
+    maximum = f"at most {peak / 2**20:.0f} MiB over the start, {ceiling / 2**20:.0f} MiB estimated"
     rows = [("memory", growth, slope < 1.0), ("memory ceiling", maximum, peak <= ceiling)]
     for fault, found, met in rows:
         row = {"name": f"{fault}, {steps} steps", "trials": 1, "lost": 0, "found": found}

@@ -332,13 +332,13 @@ class SplatRenderer {
   }
 
   // The alpha of a Gaussian at a pixel, as in the shaders, and its depth.
-  alphaAt(camera, view, pixel, gaussian, [least, largest]) {
+  alphaAt(camera, view, pixel, gaussian, [min, max]) {
     const { rotation, position } = camera;
     const [x, y, z, opacity, cxx, cxy, cxz, cyy, cyz, czz] = gaussian;
     const relative = [x - position[0], y - position[1], z - position[2]];
     const depth = dot(rotation[2], relative);
     const rows = [0, 1].map((axis) => {  // of the Jacobian times the rotation
-      const slope = clamped(dot(rotation[axis], relative) / depth, least[axis], largest[axis]);
+      const slope = clamped(dot(rotation[axis], relative) / depth, min[axis], max[axis]);
       return rotation[axis].map((value, i) => view.focal[axis] * (value - slope * rotation[2][i]) / depth);
     });
     const spread = rows.map(([a, b, c]) => [

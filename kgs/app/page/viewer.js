@@ -9,7 +9,7 @@ const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a
 const add = (a, b, factor = 1) => a.map((value, i) => value + factor * b[i]);
 const normalised = (a) => a.map((value) => value / Math.hypot(...a));
 const interpolated = (a, b, share) => a.map((value, i) => value + share * (b[i] - value));
-const clamped = (value, least, most) => Math.min(most, Math.max(least, value));
+const clamped = (value, min, max) => Math.min(max, Math.max(min, value));
 
 const CLICK_PIXELS = 4;  // a pointer that moves farther than this drags
 const FLIGHT_MILLISECONDS = 700;
@@ -46,8 +46,8 @@ function softened(change, angle, [low, high]) {
   const soft = SOFT_END * (high - low);
   const beyond = change > 0 ? angle - high : low - angle;
   const share = clamped(1 - beyond / soft, 0, 1);
-  const [least, most] = [Math.min(angle, low - soft), Math.max(angle, high + soft)];
-  return clamped(angle + share * change, least, most) - angle;
+  const [min, max] = [Math.min(angle, low - soft), Math.max(angle, high + soft)];
+  return clamped(angle + share * change, min, max) - angle;
 }
 
 const wantsLessMotion = () => matchMedia("(prefers-reduced-motion: reduce)").matches;
@@ -241,10 +241,10 @@ class Viewer {
     const coverage = (from) => this.renderer.coverage(this.withNearPlane(from), this.viewOf(from));
     this.usualCoverage ??= coverage(this.scene.cameras[this.chosen]);
     const farther = Math.max(1, eye.distance / this.usualDistance);
-    const least = Math.min(MIN_COVERAGE, MIN_PART * this.usualCoverage) / farther ** 2;
+    const enough = Math.min(MIN_COVERAGE, MIN_PART * this.usualCoverage) / farther ** 2;
     const covered = coverage(eye);
-    if (covered >= 2 * least) this.roamedTo = ahead;
-    return covered >= least || covered >= coverage(before);
+    if (covered >= 2 * enough) this.roamedTo = ahead;
+    return covered >= enough || covered >= coverage(before);
   }
 
   // An eye that is turned around its target.

@@ -143,8 +143,8 @@ def solve(
         names: the names of the photos to register, by those of the images in the database.
         focals: the focal length of each lens in pixels if they are known; (): they are adjusted.
         first_pair: the images in the database that are registered first; None: the mapper chooses.
-        start: cameras of other matches that are there before any photo is registered. Their points are computed anew,
-            from the matches of the database, and then the cameras are adjusted to these.
+        start: cameras of other matches that are there before any photo is registered. Their points are triangulated
+            again, from the matches of the database, and then the cameras are adjusted to these.
         min_registered: how many photos have to be; where the first round registers fewer, the result is None.
     """
     best = None
