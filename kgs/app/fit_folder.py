@@ -5,12 +5,9 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
-from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
-
-from torch import Tensor
 
 from kgs._support.errors import DataError, printable
 from kgs._support.json_files import write_json
@@ -250,16 +247,12 @@ def _write_results(fit: Fit, folder: Path, names: dict[str, str], request: Scene
     write_curve(folder / "curve.png", {"": fit.history["curve"]})
     notes = write_exports(fit, folder, request.roll)
     (folder / _TEST).mkdir()
-    with progress(len(scene.test), "test pictures", unit="view") as advance:
-
-        def write_picture(i: int, image: Tensor) -> None:
-            picture = as_taken(scene.test.as_photo(i, image[0]), scene.test, i)
-            write_png(folder / _TEST / names[scene.test.names[i]], picture)
-            advance()
-
-        metrics = measure(fit, lpips, write_picture)
+    for i, name in each(list(enumerate(scene.test.names)), "test pictures", "view"):
+        picture = scene.test.as_photo(i, fit.test_renders[i].image[0])
+        write_png(folder / _TEST / names[name], as_taken(picture, scene.test, i))
+    metrics = measure(fit, lpips)
     write_json(folder / "metrics.json", metrics)
-    return replace(fit, metrics=metrics, notes=(*fit.notes, *notes))
+    return fit.annotated(metrics=metrics, notes=(*fit.notes, *notes))
 
 
 def train(

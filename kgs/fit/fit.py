@@ -1,8 +1,8 @@
 """A fit that is done, or as far as it is: a splat with what is needed to render, measure and show it."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import torch
 from kornia.geometry.camera import PinholeCamera
@@ -19,6 +19,7 @@ from kgs.types import RasterOptions
 from .config import FitConfig
 from .decisions import Decisions
 from .targets import background_of
+from .view_renders import ViewRenders
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,22 @@ class Fit:
     @cached_property
     def _background(self) -> Tensor | None:
         return background_of(self.scene, self.device)
+
+    @cached_property
+    def train_renders(self) -> ViewRenders:
+        """The renders of the training views, each made once: they stay what they are if the model trains on."""
+        return ViewRenders(self.scene.train, self.render_with_depth)
+
+    @cached_property
+    def test_renders(self) -> ViewRenders:
+        """The renders of the test views, as :attr:`train_renders`."""
+        return ViewRenders(self.scene.test, self.render_with_depth)
+
+    def annotated(self, **changes: Any) -> Self:
+        """The fit with other `decisions`, `metrics` or `notes`: it renders the same, and keeps what it has rendered."""
+        annotated = replace(self, **changes)
+        vars(annotated).update(train_renders=self.train_renders, test_renders=self.test_renders)
+        return annotated
 
     @torch.no_grad()
     def render(self, camera: PinholeCamera, gains: Tensor | None = None) -> Tensor:

@@ -1,13 +1,12 @@
 """Measures a fit: the content of metrics.json."""
 
-from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
-from torch import Tensor
-
+from kgs._support.errors import DataError
 from kgs._support.machine import peak_rss_mb, versions
-from kgs.metrics.coverage import Coverage
-from kgs.metrics.evaluate import evaluate, views_to_correct
+from kgs.metrics.coverage import psnr_by_coverage
+from kgs.metrics.evaluate import MEASURES, evaluate_images, views_to_correct
 from kgs.metrics.lpips import Lpips
 
 from .fit import Fit
@@ -36,13 +35,12 @@ def used_init(asked: str, kind: str) -> str:
     return asked if (asked, kind) == ("scene", "random") else kind
 
 
-def measure(fit: Fit, lpips: Lpips | None = None, look: Callable[[int, Tensor], None] | None = None) -> dict[str, Any]:
+def measure(fit: Fit, lpips: Lpips | None = None) -> dict[str, Any]:
     """Measure a fit on its test and training views.
 
     Args:
         fit: of kgs; a splat alone has no settings.
         lpips: the perceptual metric, on the device of the fit, or None to leave it out.
-        look: called with the number of each test view and its render, see :func:`kgs.metrics.evaluate.evaluate`.
 
     Returns:
         The content of metrics.json as plain values; None stands for what was not measured. Where the training photos
@@ -66,21 +64,17 @@ def measure(fit: Fit, lpips: Lpips | None = None, look: Callable[[int, Tensor], 
         poses += ", those of the training views refined by the fit"
     everywhere = all(views.valid_mask is None for views in (scene.train, scene.test))
     pixels = "all pixels" if everywhere else "the pixels that count; SSIM and LPIPS take the others as equal"
-    coverage = Coverage(scene, fit.median_depth)
-
-    def look_at(view: int, image: Tensor) -> None:
-        coverage.add(view, image)
-        if look is not None:
-            look(view, image)
-
+    train = fit.train_renders
+    test = fit.test_renders
     color_corrected = {}
     if scene.train.gains is not None and len(scene.test):
-        color_corrected["color_corrected"] = evaluate(fit.render, views_to_correct(scene), lpips, correct_color=True)
+        views = views_to_correct(scene)
+        color_corrected["color_corrected"] = evaluate_images(test.images, views, lpips, correct_color=fit.render)
     return {
-        "test": evaluate(fit.render, scene.test, lpips, look=look_at) if len(scene.test) else None,
+        "test": evaluate_images(test.images, scene.test, lpips) if len(scene.test) else None,
         **color_corrected,
-        "train": evaluate(fit.render, scene.train, lpips),
-        "seen": coverage.means(),
+        "train": evaluate_images(train.images, scene.train, lpips),
+        "seen": psnr_by_coverage(scene, train.median_depths, test.images, test.median_depths),
         **fit.history,
         "decisions": fit.decisions.to_dict(),
         "peak_rss_mb": peak_rss_mb() or None,
@@ -99,3 +93,46 @@ def measure(fit: Fit, lpips: Lpips | None = None, look: Callable[[int, Tensor], 
         },
         "versions": versions(),
     }
+
+
+def measure_again(fit: Fit, path: Path, lpips: Lpips | None = None) -> dict[str, Any]:
+    """The metrics of a fit that was read from its folder, measured again.
+
+    Args:
+        fit: with its metrics.
+        path: of the file that they were read from, which an error names.
+        lpips: the perceptual metric, or None: the old values stay.
+
+    Raises:
+        DataError: they are of other views.
+    """
+    scene = fit.scene
+    parts = {"test": (scene.test, fit.test_renders), "train": (scene.train, fit.train_renders)}
+    if fit.metrics.get("color_corrected"):
+        parts["color_corrected"] = views_to_correct(scene), fit.test_renders
+    fresh: dict[str, Any] = {}
+    for part, (views, renders) in parts.items():
+        old = fit.metrics.get(part) or {"views": []}
+        try:
+            old_rows = {row["name"]: row for row in old["views"]}
+        except (KeyError, TypeError) as error:
+            raise DataError(path, part, f"expected the metrics of a fit, got {str(old)[:60]}") from error
+        if set(old_rows) != set(views.names):
+            raise DataError(path, part, f"has other views than the {len(views)} of {scene.root}: fit again")
+        fresh[part] = None
+        if old_rows:
+            is_corrected = part == "color_corrected"
+            new = evaluate_images(renders.images, views, lpips, correct_color=fit.render if is_corrected else None)
+            if lpips is None:
+                _copy_lpips(old, new)
+                for row in new["views"]:
+                    _copy_lpips(old_rows[row["name"]], row)
+            fresh[part] = new
+    return fit.metrics | fresh
+
+
+def _copy_lpips(source: dict[str, Any], target: dict[str, Any]) -> None:
+    """Copy the values of LPIPS, None where there are none."""
+    for key in MEASURES:
+        if key.startswith("lpips"):
+            target[key] = source.get(key)

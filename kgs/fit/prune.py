@@ -1,21 +1,19 @@
 """Removes what the training views do not need: Gaussians that contribute next to nothing, and unused harmonics."""
 
-from collections.abc import Iterator
 from dataclasses import replace
-from functools import cache
 
 import torch
 from torch import Tensor
 
 from kgs.camera import move_camera
 from kgs.datasets.scene import Views
-from kgs.metrics.evaluate import clipped_psnr
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 from kgs.types import RasterOptions
 
 from .decisions import Decisions, PruningDecision
 from .fit import Fit
+from .view_renders import ViewRenders
 
 TOLERANCE = 0.01  # dB by which the PSNR of a training view may change
 # Limits on what a Gaussian contributes to all training views together, in pixels; -1 keeps all.
@@ -43,7 +41,7 @@ def prune(fit: Fit) -> Fit:
             break
     pruned = _with_lowest_degree(fit, pruned, levels)
     kept = PruningDecision(len(model), len(pruned.model), limit, pruned.part["sh_degree"])
-    return replace(pruned, decisions=replace(fit.decisions, gaussians=kept))
+    return pruned.annotated(decisions=replace(fit.decisions, gaussians=kept))
 
 
 def _part(fit: Fit, rows: Tensor, sh_degree: int) -> Fit:
@@ -54,30 +52,24 @@ def _part(fit: Fit, rows: Tensor, sh_degree: int) -> Fit:
 
 def _with_lowest_degree(fit: Fit, pruned: Fit, levels: list[float]) -> Fit:
     """The pruned fit with the lowest degree that changes no image."""
-    views = fit.scene.train
     rows = pruned.part["rows"].to(fit.device)
-    image_of = cache(lambda i: pruned.render(views.camera(i)))
     for degree in range(fit.model.sh_degree):
         lower = _part(fit, rows, degree)
-        changes = ((lower.render(views.camera(i)) - image_of(i)).abs() for i in range(len(views)))
-        if all(bool((change <= QUANTUM).all()) for change in changes) and _is_as_good(lower, levels):
+        pairs = zip(lower.train_renders.images, pruned.train_renders.images, strict=True)
+        if all(bool(((one - other).abs() <= QUANTUM).all()) for one, other in pairs) and _is_as_good(lower, levels):
             return lower
     return pruned
 
 
 def _is_as_good(fit: Fit, levels: list[float]) -> bool:
     """Whether no training view has another PSNR; none is rendered after one that has."""
-    return all(abs(level - before) <= TOLERANCE for level, before in zip(_levels(fit), levels, strict=True))
+    renders = fit.train_renders
+    return all(abs(level - before) <= TOLERANCE for level, before in zip(renders.psnr_per_view, levels, strict=True))
 
 
 def psnr_per_view(fit: Fit) -> list[float]:
-    """The PSNR of each training view in dB; `kgs.metrics.evaluate.BEST` stands for infinity."""
-    return list(_levels(fit))
-
-
-def _levels(fit: Fit) -> Iterator[float]:
-    views = fit.scene.train
-    return (clipped_psnr(fit.psnr(views.select([i]))) for i in range(len(views)))
+    """The PSNR of each training view in dB, of the model as it is; `kgs.metrics.evaluate.BEST` stands for infinity."""
+    return [*ViewRenders(fit.scene.train, fit.render_with_depth).psnr_per_view]
 
 
 def contributions(model: GaussianModel, views: Views, options: RasterOptions, backend: str = "auto") -> Tensor:

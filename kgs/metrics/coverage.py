@@ -4,8 +4,7 @@ A single training view does not determine depth, and what no view shows is guess
 """
 
 import math
-from collections.abc import Callable, Sequence
-from functools import cached_property
+from collections.abc import Iterable, Sequence
 from statistics import fmean
 
 import torch
@@ -19,7 +18,10 @@ MIN_VIEWS = 2  # training views that show a point
 OCCLUDED = 1.05  # a point is hidden from a view if it is farther than this times the view's depth there
 
 
-class Coverage:
+@torch.no_grad()
+def psnr_by_coverage(
+    scene: Scene, train_depths: Sequence[Tensor], images: Iterable[Tensor], depths: Iterable[Tensor]
+) -> dict[str, float | None] | None:
     """PSNR of the test views, separately for pixels that at least `MIN_VIEWS` training views show and for the rest.
 
     Convention:
@@ -29,48 +31,31 @@ class Coverage:
 
     Args:
         scene: training and test views.
-        median_depth: from a camera to its median depth `(H, W)` on the CPU, 0 where there is nothing.
+        train_depths: median depths of the training views, each `(H, W)` on the CPU, 0 where there is nothing.
+        images: renders of the test views, each `(1, 3, H, W)`, as :meth:`kgs.datasets.scene.Views.render` returns them.
+        depths: median depths of the test views.
+
+    Returns:
+        "share" of the pixels that are shown, in [0, 1], "psnr" of them and "psnr_rest" in dB, means over the views
+        that have such pixels; None if no view has, or if the error is 0. None without test views.
     """
-
-    def __init__(self, scene: Scene, median_depth: Callable[[PinholeCamera], Tensor]) -> None:
-        self._scene = scene
-        self._median_depth = median_depth
-        self._levels: dict[str, list[float]] = {"psnr": [], "psnr_rest": []}
-        self._shares = list[float]()
-
-    @cached_property
-    def _depths(self) -> list[Tensor]:
-        """Of the training views."""
-        train = self._scene.train
-        return [self._median_depth(train.camera(view)) for view in range(len(train))]
-
-    @torch.no_grad()
-    def add(self, view: int, image: Tensor) -> None:
-        """Take in a test view: its number and its render `(1, 3, H, W)`, as :meth:`Views.render` returns it."""
-        test = self._scene.test
-        camera = test.camera(view)
-        depth = self._median_depth(camera)
-        covered = views_that_show(depth, camera, self._depths, self._scene.train.cameras) >= MIN_VIEWS
-        image, photo, _ = test.compared(view, image[0].cpu())
+    test = scene.test
+    if not len(test):
+        return None
+    levels = {"psnr": list[float](), "psnr_rest": list[float]()}
+    shares = list[float]()
+    for view, (render, depth) in enumerate(zip(images, depths, strict=True)):
+        covered = views_that_show(depth, test.camera(view), train_depths, scene.train.cameras) >= MIN_VIEWS
+        image, photo, _ = test.compared(view, render[0].cpu())
         errors = (image - photo).square().mean(dim=0)
         valid = torch.ones_like(covered) if test.valid_mask is None else test.valid_mask[view].cpu()
-        self._shares.append(float(covered[valid].float().mean()) if valid.any() else 0.0)
+        shares.append(float(covered[valid].float().mean()) if valid.any() else 0.0)
         for name, where in (("psnr", covered & valid), ("psnr_rest", ~covered & valid)):
             error = float(errors[where].mean()) if where.any() else 0.0
             if error > 0:
-                self._levels[name].append(-10 * math.log10(error))
-
-    def means(self) -> dict[str, float | None] | None:
-        """The means over the views that were added; None if none was.
-
-        Returns:
-            "share" of the pixels that are shown, in [0, 1], "psnr" of them and "psnr_rest" in dB, means over the views
-            that have such pixels; None if no view has, or if the error is 0.
-        """
-        if not self._shares:
-            return None
-        levels = {name: round(fmean(values), 4) if values else None for name, values in self._levels.items()}
-        return {"share": round(fmean(self._shares), 4), **levels}
+                levels[name].append(-10 * math.log10(error))
+    means = {name: round(fmean(values), 4) if values else None for name, values in levels.items()}
+    return {"share": round(fmean(shares), 4), **means}
 
 
 def views_that_show(depth: Tensor, camera: PinholeCamera, depths: Sequence[Tensor], cameras: PinholeCamera) -> Tensor:

@@ -9,9 +9,8 @@ Field Rendering", SIGGRAPH 2023: an 11-tap Gaussian window of deviation 1.5, a b
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
-from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
 
@@ -20,7 +19,6 @@ import torch.nn.functional as F
 from kornia.metrics import psnr, ssim
 from torch import Tensor
 
-from kgs._support.errors import DataError
 from kgs.datasets.scene import Scene, Views
 
 from .lpips import Lpips
@@ -32,25 +30,35 @@ _WINDOW = 11
 
 @torch.no_grad()
 def evaluate(
-    render: Callable[..., Tensor],
-    views: Views,
-    lpips: Lpips | None = None,
-    *,
-    correct_color: bool = False,
-    look: Callable[[int, Tensor], None] | None = None,
+    render: Callable[..., Tensor], views: Views, lpips: Lpips | None = None, *, correct_color: bool = False
 ) -> dict[str, Any]:
     """Render each view from its camera, to `(1, 3, H, W)`, and compare it with its photo; no gradients are kept.
 
     `render` is called with a camera and, where views have gains, with gains, as :meth:`kgs.fit.Fit.render` takes them.
+    All else is as of :func:`evaluate_images`.
+    """
+    images = (views.render(index, render) for index in range(len(views)))
+    return evaluate_images(images, views, lpips, correct_color=render if correct_color else None)
 
-    With `correct_color`, each channel of a render first gets the gain and the offset that fit it best to the photo:
-    what exposure and white balance of a held-out photo do is then not counted. Where views have gains, and masks let a
-    background show through, only the colours of the scene get them.
 
-    `look` is called with the number of each view and its render, as :meth:`kgs.datasets.scene.Views.render` returns it.
+@torch.no_grad()
+def evaluate_images(
+    images: Iterable[Tensor],
+    views: Views,
+    lpips: Lpips | None = None,
+    *,
+    correct_color: Callable[..., Tensor] | None = None,
+) -> dict[str, Any]:
+    """Compare the render of each view, `(1, 3, H, W)`, with its photo.
 
-    Views have at least 6 x 6 pixels, 16 x 16 with `lpips`, a network on the device of the renders. A ValueError for a
-    render that differs in shape from its photo or holds NaN or infinity.
+    Args:
+        images: the renders in the order of the views, as :meth:`kgs.datasets.scene.Views.render` returns them.
+        views: with at least 6 x 6 pixels, 16 x 16 with `lpips`.
+        lpips: a network on the device of the renders; None: LPIPS is not measured.
+        correct_color: the function that renders, to give each channel of a render the gain and the offset that fit it
+            best to the photo first: what exposure and white balance of a held-out photo do is then not counted. Where
+            views have gains, and masks let a background show through, only the colours of the scene get them. None:
+            the renders are compared as they are.
 
     Returns:
         Means over views under "psnr" (dB), "ssim" (Kornia's, reflected border), "ssim_zero_padded" (that of the
@@ -58,24 +66,25 @@ def evaluate(
         as in the published tables); under "views" a list with "name" and the same keys for each view. None stands for
         what was not measured, and for an infinite PSNR (a render equal to its photo, or a mean with one). Where not all
         pixels count, "valid" is the share that does.
+
+    Raises:
+        ValueError: a render differs in shape from its photo or holds NaN or infinity.
     """
     rows = list[dict[str, Any]]()
     shares = list[float]()
-    for index, name in enumerate(views.names):
-        image = views.render(index, render)
+    for index, (name, image) in enumerate(zip(views.names, images, strict=True)):
         target = views.images[index : index + 1]
         if image.shape != target.shape:
             raise ValueError(f"render: expected shape {tuple(target.shape)} for {name}, got {tuple(image.shape)}")
         if not bool(image.isfinite().all()):
             raise ValueError(f"render: expected finite values for {name}, got NaN or infinity")
-        if look is not None:
-            look(index, image)
         shown, photo, share = views.compared(index, image)
-        if correct_color:
+        if correct_color is not None:
             valid = None if views.valid_mask is None else views.valid_mask[index]
             through = None
             if views.alphas is not None and views.gains is not None:
-                through = Through(render(views.camera(index), torch.zeros(3)), views.alphas[index].to(image))
+                background = correct_color(views.camera(index), torch.zeros(3))
+                through = Through(background, views.alphas[index].to(image))
                 if views.border_mask is not None:  # the border darkens the background, too
                     valid = (views.border_mask >= 1) & (True if valid is None else valid)
             shown, _, _ = views.compared(index, color_corrected(image, shown, photo, valid, through))
@@ -129,12 +138,14 @@ def mean_psnr(render: Callable[..., Tensor], views: Views) -> float | None:
 
     `render` is called as by :meth:`kgs.datasets.scene.Views.render`.
     """
-    values = list[float]()
-    for i in range(len(views)):
-        image, photo, share = views.compared(i, views.render(i, render)[0].cpu())
-        values.append(masked_psnr(image, photo, share))
-    mean = sum(values) / len(values) if values else math.inf  # a render that equals its photo has no finite PSNR
-    return round(mean, 4) if math.isfinite(mean) else None
+    levels = [view_psnr(views.render(i, render), views, i) for i in range(len(views))]
+    return round(fmean(levels), 4) if levels and math.isfinite(sum(levels)) else None
+
+
+def view_psnr(image: Tensor, views: Views, index: int) -> float:
+    """PSNR in dB of the render of one view, `(1, 3, H, W)`, clamped; infinity if it equals its photo."""
+    shown, photo, share = views.compared(index, image[0].cpu())
+    return masked_psnr(shown, photo, share)
 
 
 def masked_psnr(image: Tensor, photo: Tensor, share: float) -> float:
@@ -145,41 +156,6 @@ def masked_psnr(image: Tensor, photo: Tensor, share: float) -> float:
 def clipped_psnr(level: float | None) -> float:
     """A PSNR in dB, at most `BEST`; None, an infinite one, is `BEST`."""
     return BEST if level is None else min(level, BEST)
-
-
-def measure_again(
-    path: Path, metrics: dict[str, Any], scene: Scene, render: Callable[..., Tensor], lpips: Lpips | None
-) -> dict[str, Any]:
-    """The content of a metrics.json, measured again; without `lpips`, the old values of LPIPS are copied.
-
-    DataError if the views differ.
-    """
-    fresh: dict[str, Any] = {}
-    parts = [("test", scene.test), ("train", scene.train)]
-    if metrics.get("color_corrected"):
-        parts.append(("color_corrected", views_to_correct(scene)))
-    for part, views in parts:
-        old = metrics.get(part) or {"views": []}
-        try:
-            old_rows = {row["name"]: row for row in old["views"]}
-        except (KeyError, TypeError) as error:
-            raise DataError(path, part, f"expected the metrics of a fit, got {str(old)[:60]}") from error
-        if set(old_rows) != set(views.names):
-            raise DataError(path, part, f"has other views than the {len(views)} of {scene.root}: fit again")
-        new = evaluate(render, views, lpips, correct_color=part == "color_corrected") if old_rows else None
-        if new is not None and lpips is None:
-            _copy_lpips(old, new)
-            for row in new["views"]:
-                _copy_lpips(old_rows[row["name"]], row)
-        fresh[part] = new
-    return metrics | fresh
-
-
-def _copy_lpips(source: dict[str, Any], target: dict[str, Any]) -> None:
-    """Copy the values of LPIPS, None where there are none."""
-    for key in MEASURES:
-        if key.startswith("lpips"):
-            target[key] = source.get(key)
 
 
 def _measure(image: Tensor, target: Tensor, share: float, lpips: Lpips | None) -> dict[str, float | None]:

@@ -89,7 +89,7 @@ def fit_and_measure(
     trainer = Trainer(scene, plan, points) if rival is None else RivalTrainer(scene, plan, points, rival)
     fit = prune(trainer.fit(tell_steps()))
     cpu_seconds = time.process_time() - begin
-    fit = replace(fit, metrics=measure(fit, lpips))
+    fit = fit.annotated(metrics=measure(fit, lpips))
     stored = {
         **{part: {name: fit.metrics[part][name] for name in MEASURES} for part in ("test", "train")},
         "init": {**fit.history["init"]},

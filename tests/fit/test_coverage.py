@@ -12,7 +12,7 @@ from kgs.fit.config import FitConfig
 from kgs.fit.plan import make_plan
 from kgs.fit.run import choose_points
 from kgs.fit.trainer import Trainer
-from kgs.metrics.coverage import MIN_VIEWS, Coverage, views_that_show
+from kgs.metrics.coverage import MIN_VIEWS, psnr_by_coverage, views_that_show
 
 HEIGHT, WIDTH, FOCAL, DEPTH = 10, 40, 20.0, 5.0
 
@@ -63,9 +63,9 @@ def fit():
 
 def test_both_parts_together_are_the_whole(fit):
     scene = fit.scene
-    coverage = Coverage(scene, fit.median_depth)
-    coverage.add(0, fit.render(scene.test.camera(0)))
-    found = coverage.means()
+    found = psnr_by_coverage(
+        scene, fit.train_renders.median_depths, fit.test_renders.images, fit.test_renders.median_depths
+    )
     assert 0.3 < found["share"] < 1
     errors = [10 ** (-found[name] / 10) for name in ("psnr", "psnr_rest")]
     render = fit.render(scene.test.camera(0)).clamp(0, 1)
@@ -76,4 +76,4 @@ def test_both_parts_together_are_the_whole(fit):
 
 def test_without_test_views_there_is_nothing_to_say(fit):
     scene = synthetic_scene(train_views=1, test_views=0, size=(8, 8))
-    assert Coverage(scene, fit.median_depth).means() is None
+    assert psnr_by_coverage(scene, fit.train_renders.median_depths, [], []) is None

@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,9 @@ from factories import random_views
 
 from kgs._support.errors import DataError
 from kgs.datasets.scene import Scene
-from kgs.metrics.evaluate import BEST, clipped_psnr, evaluate, mean_psnr, measure_again
+from kgs.fit.measures import measure_again
+from kgs.fit.view_renders import ViewRenders
+from kgs.metrics.evaluate import BEST, clipped_psnr, evaluate, mean_psnr
 from kgs.metrics.lpips import Lpips
 
 KEYS = {"psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled", "views"}
@@ -42,6 +45,14 @@ def numpy_ssim(image, target, mode):
     xy = windowed(image * target) - x * y
     c1, c2 = 0.01**2, 0.03**2
     return np.mean((2 * x * y + c1) * (2 * xy + c2) / ((x**2 + y**2 + c1) * (xx + yy + c2)))
+
+
+def saved(render, scene, metrics):
+    """A fit that was read from its folder, with these renders of both parts."""
+    renders = [ViewRenders(views, lambda camera, gains: (render(camera), None)) for views in (scene.train, scene.test)]
+    return SimpleNamespace(
+        scene=scene, metrics=metrics, render=render, train_renders=renders[0], test_renders=renders[1]
+    )
 
 
 def test_measures_are_numpys_for_each_view_and_their_mean_on_top():
@@ -119,10 +130,10 @@ def test_lpips_that_is_not_measured_again_is_kept():
     lpips = Lpips()
     measured = [evaluate(render, views, lpips, correct_color=correct_color) for correct_color in (False, True)]
     metrics = {"test": measured[0], "train": measured[0], "color_corrected": measured[1], "steps": 3}
-    assert measure_again(Path("metrics.json"), metrics, scene, render, None) == metrics
+    assert measure_again(saved(render, scene, metrics), Path("metrics.json")) == metrics
     wrong = {**metrics, "color_corrected": {"views": []}}
     with pytest.raises(DataError, match="color_corrected"):
-        measure_again(Path("metrics.json"), wrong, scene, render, None)
+        measure_again(saved(render, scene, wrong), Path("metrics.json"))
 
 
 def test_masked_views_without_gains_are_recoloured_for_a_render_that_takes_a_camera_only():
@@ -136,7 +147,7 @@ def test_masked_views_without_gains_are_recoloured_for_a_render_that_takes_a_cam
         part: evaluate(render, masked, correct_color=part == "color_corrected")
         for part in ("test", "train", "color_corrected")
     }
-    assert measure_again(Path("metrics.json"), metrics, scene, render, None) == metrics
+    assert measure_again(saved(render, scene, metrics), Path("metrics.json")) == metrics
 
 
 def test_float64_renders_are_measured():

@@ -14,7 +14,7 @@ from kgs.fit import Fit
 from kgs.fit.config import PRESETS, FitConfig
 from kgs.fit.decisions import Decisions, ExposureDecision
 from kgs.fit.exposure import MIN_RATIO, decide_exposure, estimate_gains, with_exposure
-from kgs.fit.measures import measure
+from kgs.fit.measures import measure, measure_again
 from kgs.fit.plan import make_plan
 from kgs.fit.prune import psnr_per_view
 from kgs.fit.run import choose_points, decide, fit_scene
@@ -22,7 +22,7 @@ from kgs.fit.targets import targets
 from kgs.fit.trainer import Trainer
 from kgs.init_points import InitialPoints, initial_points
 from kgs.init_points.patches import MIN_PATCHES, PatchColors
-from kgs.metrics.evaluate import clipped_psnr, color_corrected, evaluate, measure_again
+from kgs.metrics.evaluate import clipped_psnr, color_corrected, evaluate
 
 GAINS = torch.tensor([[0.5, 0.5, 0.5], [0.8, 0.8, 0.8], [1.25, 1.25, 1.25], [1.1, 1.0, 0.8]])
 
@@ -212,7 +212,7 @@ def test_a_background_that_shows_through_is_not_exposed_in_any_measure(see_throu
     assert clipped_psnr(metrics["train"]["psnr"]) > 80
     assert metrics["test"]["psnr"] < 40
     assert clipped_psnr(metrics["color_corrected"]["psnr"]) > 60, "the colours of the scene alone are fitted"
-    again = measure_again(Path("metrics.json"), metrics, scene, see_through.render, None)
+    again = measure_again(see_through.annotated(metrics=metrics), Path("metrics.json"))
     assert again["train"] == metrics["train"]
 
 
@@ -233,8 +233,8 @@ def test_a_background_that_shows_through_is_not_exposed_in_the_curve_and_in_pict
         ).image
         seen = scene.train.as_photo(view, scene.train.render(view, see_through.render))
         torch.testing.assert_close(seen, target.as_photographed(own).detach(), atol=1e-6, rtol=0)
-    with_metrics = replace(see_through, metrics=measure(see_through))
-    for i, picture in enumerate(fit_page._pictures([scene.train], {"": with_metrics})):
+    with_metrics = see_through.annotated(metrics=measure(see_through))
+    for i, picture in enumerate(fit_page._pictures([scene.train], {"": with_metrics}, fit_page._kept_image)):
         torch.testing.assert_close(picture.renders[""], scene.train.images[i], atol=1e-5, rtol=0)
 
 

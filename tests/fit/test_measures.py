@@ -48,12 +48,15 @@ def test_random_points_of_a_layout_are_those_of_the_scene():
     assert used_init("dense", "model-points") == "model-points"
 
 
-def test_a_test_view_is_rendered_once_and_shown_to_who_looks(tiny, monkeypatch):
-    fit = fit_scene(tiny, replace(CONFIG, init="random"))
-    plain = fit.render(tiny.test.camera(0))
-    renders = []
-    monkeypatch.setattr(type(fit), "render", lambda _, camera: renders.append(camera) or plain)
-    looks = []
-    measure(fit, look=lambda view, image: looks.append((view, image)))
-    assert looks == [(0, plain)]
-    assert len(renders) == len(tiny.test) + len(tiny.train)
+def test_each_view_is_rendered_once_for_all_measures(tiny, monkeypatch):
+    fit = fit_scene(tiny, replace(CONFIG, init="random", prune=True))
+    cameras = []
+    render = fit.test_renders._render
+    monkeypatch.setattr(fit.test_renders, "_render", lambda *given: cameras.append(given) or render(*given))
+    monkeypatch.setattr(fit.train_renders, "_render", None)  # pruning has rendered these
+    metrics = measure(fit)
+    assert len(cameras) == len(tiny.test)
+    assert metrics["seen"] is not None
+    measured = fit.annotated(metrics=metrics)
+    assert measured.test_renders[0] is fit.test_renders[0]
+    assert torch.equal(measured.test_renders[0].image, fit.render(tiny.test.camera(0)))

@@ -147,11 +147,10 @@ def run_demo(
         if signal:
             raise SystemExit(128 + signal)
         runs[name] = measure(fit)
-        fits[title] = replace(fit, metrics=runs[name])
+        fits[title] = fit.annotated(metrics=runs[name])
     levels = list(map(_level, runs[name]["test"]["views"]))
     worst = sorted(range(len(levels)), key=levels.__getitem__)[:2]
-    cameras = [scene.test.camera(i) for i in range(len(scene.test))]
-    renders = {title: [one.render(camera)[0] for camera in cameras] for title, one in fits.items()}
+    renders = {title: [image[0] for image in one.test_renders.images] for title, one in fits.items()}
     shown = [f"The viewer and the sliders show the fit {title}."] if len(runs) > 1 else []
     with replacing(out, "demo", all_former=True) as new:
         save_ply(new / "splat.ply", fit.model, offset=scene.offset)

@@ -1,6 +1,5 @@
 """`kgs eval`: measures a fit again."""
 
-from dataclasses import replace
 from pathlib import Path
 
 from kgs._support.errors import DataError, printable
@@ -42,18 +41,19 @@ def evaluate(
     from kgs.app.files.locks import locked
     from kgs.app.page.fit_page import PAGE, write_own_page
     from kgs.app.saved_fit import load_fit
-    from kgs.metrics.evaluate import as_text, measure_again
+    from kgs.fit.measures import measure_again
+    from kgs.metrics.evaluate import as_text
     from kgs.metrics.lpips import Lpips
 
     lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(device)
     request, fit = load_fit(out, device, backend, say)
     path = out / "metrics.json"
-    metrics = measure_again(path, fit.metrics, fit.scene, fit.render, lpips)
+    metrics = measure_again(fit, path, lpips)
     with locked(out), replacing(out, "fit") as new:
         if read_json(path) != fit.metrics:
             raise DataError(out, "", "a new fit took the place of the one that was measured: measure again")
         write_json(new / path.name, metrics)
-        write_own_page(new, out, replace(fit, metrics=metrics), request, config=out / "config.json")
+        write_own_page(new, out, fit.annotated(metrics=metrics), request, config=out / "config.json")
     say(as_text(metrics))
     say(f"{printable(path)} and {printable(out / PAGE)} are up to date")
     say_next(f"open {as_line(out / PAGE)} in a browser")

@@ -1,7 +1,7 @@
 """The page of a fit, index.html: collects the content for :func:`kgs.app.page.write_page` from a fit and its files."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from os import PathLike
@@ -15,7 +15,7 @@ from torch import Tensor
 from kgs._support.errors import DataError
 from kgs._support.json_files import read_json
 from kgs.app.console import each
-from kgs.app.files.cameras import shown
+from kgs.app.files.cameras import as_taken, shown
 from kgs.app.scene_request import SceneRequest
 from kgs.datasets.folders import CAMERAS_REPORT
 from kgs.datasets.load import load_scene
@@ -85,6 +85,7 @@ def write_fit_page(
     photographed = beside or views.select(spread(len(views), MAX_PICTURES))
     pictured = shown(photographed, roll) if photos else []
     parts = [*shown(scene.train, roll), *shown(scene.test, roll)]
+    image_of = _kept_image if beside is None and not roll else _new_image
     thumbnailed = [] if not photos else parts if small is None else shown(small, roll)
     with torch.no_grad():
         gaussians = fit.model()
@@ -100,7 +101,7 @@ def write_fit_page(
         ),
         photos=replace(
             _photos(scene, words, roll),
-            pictures=_pictures(pictured, fits),
+            pictures=_pictures(pictured, fits, image_of),
             pictures_note=_pictures_note(sum(map(len, pictured)), len(views), word),
             thumbnails=_thumbnails(thumbnailed),
         ),
@@ -187,17 +188,34 @@ def _photos(scene: Scene, words: tuple[str, str], roll: float) -> PagePhotos:
     )
 
 
-def _pictures(parts: Sequence[Views], fits: Mapping[str, Fit]) -> list[Picture]:
-    """The photos of some views beside the renders of each fit."""
+def _pictures(
+    parts: Sequence[Views], fits: Mapping[str, Fit], image_of: Callable[[Fit, Views, int], Tensor]
+) -> list[Picture]:
+    """The photos of some views beside the images of each fit."""
     levels = {run: psnr_of_views(fit.metrics) for run, fit in fits.items()}
     pictures = []
     for views, i in each([(part, i) for part in parts for i in range(len(part))], "page", "view"):
         name = views.names[i]
-        renders = {run: views.as_photo(i, views.render(i, fit.render)[0]) for run, fit in fits.items()}
+        renders = {run: image_of(fit, views, i) for run, fit in fits.items()}
         values = [f"{run} {levels[run][name]:.2f} dB".strip() for run in fits if name in levels[run]]
         caption = f"{name}: {', '.join(values)}" if values else name
         pictures.append(Picture(name, views.images[i], renders, caption))
     return pictures
+
+
+def _kept_image(fit: Fit, views: Views, index: int) -> Tensor:
+    """What a fit shows of a view that is one of its own."""
+    name = views.names[index]
+    for own, renders in ((fit.scene.test, fit.test_renders), (fit.scene.train, fit.train_renders)):
+        if name in own.names:
+            i = own.names.index(name)
+            return as_taken(own.as_photo(i, renders[i].image[0]), own, i)
+    raise KeyError(name)
+
+
+def _new_image(fit: Fit, views: Views, index: int) -> Tensor:
+    """What a fit shows of any view."""
+    return views.as_photo(index, views.render(index, fit.render)[0])
 
 
 def _thumbnails(parts: Sequence[Views]) -> dict[str, Tensor]:
