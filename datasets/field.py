@@ -1,9 +1,8 @@
 """The size in which a standard download is compared in the literature, where it holds its photos in several sizes."""
 
-from pathlib import Path
+from os import PathLike
 
-from .folders import layout_of
-from .layouts import find_layout
+from .source import SceneSource
 
 _FOLDER = "images_8"  # of LLFF and of Mip-NeRF 360, with three to 24 views
 _FACTOR = 8
@@ -11,30 +10,30 @@ _LARGE = 2000  # pixels: photos that were made for cameras of fewer have been re
 _BLENDER = 800  # pixels of the download's images, which are halved
 
 
-def field_size(root: Path) -> tuple[str, float | None, str]:
+def field_size(scene: str | PathLike[str] | SceneSource) -> tuple[str, float | None, str]:
     """Which photos of a scene are those of published tables with few views, and by how much they are to be reduced.
 
     LLFF and COLMAP scenes: an eighth of the photos that the cameras are for, in `images_8` or made from what is there.
     Blender scenes: 400 pixels. All others, and what is as small already: as it is.
 
     Args:
-        root: the folder of a scene.
+        scene: its folder, or that folder opened before.
 
     Returns:
         `photo_folder` and `downscale` for :func:`kgs.datasets.load_scene`, and a sentence about them.
 
     Raises:
-        DataError: it is not a scene.
+        DataError: it is not a scene, or its files are missing or damaged.
     """
-    layout = layout_of(root)
-    if (root / _FOLDER).is_dir() and layout in ("LLFF", "COLMAP"):
+    source = SceneSource.of(scene)
+    if (source.root / _FOLDER).is_dir() and source.has_sizes:
         return _FOLDER, None, f"photos of {_FOLDER}/, the size of published tables"
-    frame = find_layout(root).frames[0]
+    frame = source.frames().frames[0]
     width, height = frame.image.size
     wanted = max(width, height)
-    if layout == "Blender" and wanted == _BLENDER:
+    if source.layout == "Blender" and wanted == _BLENDER:
         wanted //= 2
-    elif layout in ("LLFF", "COLMAP"):
+    elif source.has_sizes:
         full = max(frame.intrinsics.width, frame.intrinsics.height)
         wanted = round(full / _FACTOR) if full >= _LARGE else wanted
     factor = max(width, height) / wanted

@@ -227,9 +227,8 @@ def _is_model_beside_photos(root: Path) -> bool:
     return _is_model(root) and (image_folder(root) is not None or bool(list_images(root)))
 
 
-def unused_files(root: Path) -> tuple[str, ...]:
-    """What a folder holds besides its layout's files that looks like cameras: one sentence each."""
-    layout = layout_of(root)
+def unused_files(root: Path, layout: str | None = None) -> tuple[str, ...]:
+    """What a folder holds besides the files of its layout, or of any, that looks like cameras: one sentence each."""
     sentences = []
     for other, name in LAYOUT_FILES.items():
         if other != layout and (root / name).is_file():
@@ -247,13 +246,11 @@ def unused_files(root: Path) -> tuple[str, ...]:
     return tuple(sentences)
 
 
-def nearest_scene(root: Path) -> Path | None:
-    """The folder with camera poses that is meant by a folder: itself, or one up to two levels below or above it.
+def scene_nearby(root: Path) -> Path | None:
+    """The folder with camera poses that is meant by a folder without: one up to two levels below or above it.
 
     One whose cameras kgs found (beside `CAMERAS_REPORT`) is not meant by its photos. None: there is none.
     """
-    if layout_of(root):
-        return root
     below = sorted(path for pattern in ("*", "*/*") for path in root.glob(pattern) if path.is_dir())
     others = (path for path in (*below, *root.resolve().parents[:2]) if not (path / CAMERAS_REPORT).exists())
     return next(filter(layout_of, others), None)
@@ -296,7 +293,7 @@ def _about_folder(root: Path) -> str:
 
 
 def _what_is_there(root: Path) -> str:
-    if folder := nearest_scene(root):
+    if folder := scene_nearby(root):
         return f"is not a scene, but {folder} is one: give that folder"
     photos = image_folder(root) or root
     if count := len(list_images(photos)):

@@ -22,11 +22,11 @@ from .folders import CAMERAS_REPORT
 from .frames import LARGEST, Frame, FrameSet
 from .image_file import color_notes
 from .images import rectification, remap, resize
-from .layouts import find_layout
 from .mask_files import find_mask_files
 from .masks import as_masks
 from .options import BACKGROUNDS, check_options
 from .scene import Scene, Views, pinholes
+from .source import SceneSource
 from .splits import TEST_EVERY, select_evenly, split_between_ends, split_by_name
 
 _LISTED = 20
@@ -42,7 +42,7 @@ _FINE_PIXELS = 1_000_000  # of an image for the initial points: twice the width 
 
 
 def load_scene(
-    path: str | PathLike[str],
+    path: str | PathLike[str] | SceneSource,
     train_views: int | None = None,
     downscale: float | None = None,
     *,
@@ -67,7 +67,7 @@ def load_scene(
         world is the files', moved by `Scene.offset` (the mean of the training cameras' centres), not scaled or turned.
 
     Args:
-        path: the scene's folder.
+        path: the scene's folder, or that folder opened before.
         train_views: how many views to train on, spread evenly over those that are not held out; None takes all.
         downscale: factor by which the photos (of `images/`, else of the largest `images_k/`) are reduced, >= 1; None
             leaves them as they are.
@@ -98,10 +98,11 @@ def load_scene(
         >>> cameras = load_scene("fern", photos=False).test.cameras  # decodes no photo  # doctest: +SKIP
     """
     check_options(downscale, hold_out, background, points, mask_mode)
-    root = Path(path)
+    source = SceneSource.of(path)
+    root = source.root
     # The context torch.device("cpu") slows torch down: it is entered only if the default device is another.
     with nullcontext() if torch.get_default_device().type == "cpu" else torch.device("cpu"):
-        frame_set = _with_masks(root, find_layout(root, photo_folder), None if masks is None else Path(masks))
+        frame_set = _with_masks(root, source.frames(photo_folder), None if masks is None else Path(masks))
         train, test = _split(root, frame_set, train_views, hold_out)
         cloud = frame_set.points
         if points == "model-points":

@@ -113,8 +113,9 @@ def fit_folder(
         try:
             if not (work / CHECKPOINT).exists():
                 save_checkpoint(work / CHECKPOINT, trainer.state_dict())  # initial points can take a minute
+            settings = _settings(trainer, request)
             with replacing(work, "fit") as new:
-                write_json(new / "config.json", _settings(trainer, request))
+                write_json(new / "config.json", settings)
             stages.begin("fit")
             page = until_the_end.enter_context(_live_page(trainer, request, out, say)) if live else None
             fit, stopped_by = train(trainer, work / CHECKPOINT, live=page)
@@ -125,7 +126,7 @@ def fit_folder(
                 for note in fit.notes:
                     trainer.state.note(note)
                 stages.begin("page")
-                write_own_page(new, out, fit, request, config=work / "config.json")
+                write_own_page(new, out, fit, request, settings)
                 if not trainer.is_saved:  # results and checkpoint belong together
                     trainer.save(work / CHECKPOINT, fit.part)
             enter(work, "fit", (CHECKPOINT, PREVIOUS))

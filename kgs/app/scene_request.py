@@ -11,6 +11,7 @@ from kgs._support.json_files import is_number
 from kgs.datasets.load import load_scene
 from kgs.datasets.options import MASK_MODES
 from kgs.datasets.scene import Scene
+from kgs.datasets.source import SceneSource
 from kgs.fit.config import DETAILS
 
 _LARGER = 1.1  # how many times as large photos must be to be worth a line
@@ -48,10 +49,16 @@ class SceneRequest:
     masks: str = ""
     mask_mode: str = "ignore"
 
-    def load(self, base: Path, say: Callable[[str], None] | None = None) -> Scene:
-        """Load the scene; `base` is the folder that a relative path starts from, `say` gets the loader's notes."""
+    def load(self, base: Path, say: Callable[[str], None] | None = None, source: SceneSource | None = None) -> Scene:
+        """Load the scene.
+
+        Args:
+            base: the folder that a relative path starts from.
+            say: gets the loader's notes.
+            source: the folder of the scene where it is open already.
+        """
         scene = load_scene(
-            base / self.scene,
+            source or base / self.scene,
             self.train_views,
             self.downscale,
             hold_out=self.hold_out,
@@ -76,11 +83,11 @@ class SceneRequest:
         largest = min(DETAILS["high"].size, round(side * (self.downscale or 1.0)))
         return largest if largest > _LARGER * side else None
 
-    def shrink(self, base: Path, scene: Scene) -> float:
+    def shrink(self, source: SceneSource, scene: Scene) -> float:
         """By what factor the photos of `scene` are smaller than the largest that its folder has."""
         factor = self.downscale or 1.0
         if self.photo_folder:
-            largest = load_scene(base / self.scene, photos=False, hold_out=0).train.images.shape[-1]
+            largest = load_scene(source, photos=False, hold_out=0).train.images.shape[-1]
             factor *= largest / scene.train.images.shape[-1]
         return factor
 

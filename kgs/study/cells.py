@@ -17,6 +17,7 @@ from kgs.bench.scenes import SYNTHETIC
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.field import field_size
 from kgs.datasets.scene import Scene
+from kgs.datasets.source import SceneSource
 from kgs.fit.config import PRESETS, FitConfig
 from kgs.fit.fit import Fit
 from kgs.fit.measures import measure
@@ -128,9 +129,10 @@ def _start(
         raise DataError(name, "", "expected the environment variable KGS_DATA to name the folder of this scene")
     else:
         points_of = start if start == "model-points" else "none"
-        photo_folder, factor, _ = field_size(Path(data) / name)
+        source = SceneSource(Path(data) / name)
+        photo_folder, factor, _ = field_size(source)
         shrink = None if downscale is None and factor is None else (downscale or 1.0) * (factor or 1.0)
-        scene = load_scene(Path(data) / name, views, shrink, points=points_of, photo_folder=photo_folder)
+        scene = load_scene(source, views, shrink, points=points_of, photo_folder=photo_folder)
     config = fit_config(start, seed, {"preset": preset})
     begin = time.process_time()
     with warnings.catch_warnings(action="ignore", category=UserWarning):  # `kind` records a fallback

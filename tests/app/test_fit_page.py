@@ -17,6 +17,7 @@ import torch
 from factories import random_views
 
 from kgs._support.errors import DataError
+from kgs._support.json_files import read_json
 from kgs.app import fit_folder as app
 from kgs.app.cli.evaluate import evaluate
 from kgs.app.files.publishing import is_own
@@ -55,10 +56,9 @@ def fitted(points: Any, tmp_path_factory: Any) -> Any:
 def rewritten(fitted: Any, tmp_path: Path) -> Any:
     """Writes the page of the same fit with another scene or measures into another folder; its text."""
     out, fit = fitted
-    shutil.copyfile(out / "config.json", tmp_path / "config.json")
 
     def text(**changes: Any) -> str:
-        write_own_page(tmp_path, out, replace(fit, **changes), REQUEST)
+        write_own_page(tmp_path, out, replace(fit, **changes), REQUEST, read_json(out / "config.json"))
         return (tmp_path / "index.html").read_text(encoding="utf-8")
 
     return text
@@ -110,9 +110,8 @@ def test_without_a_photo_held_out_training_views_are_shown(fitted: Any, rewritte
 
 def test_it_says_that_a_larger_fit_is_possible(fitted: Any, tmp_path: Path) -> None:
     out, fit = fitted
-    shutil.copyfile(out / "config.json", tmp_path / "config.json")
     for downscale, expected in ((1.05, None), (4.0, 128), (100.0, 1000)):
-        write_own_page(tmp_path, out, fit, replace(REQUEST, downscale=downscale))
+        write_own_page(tmp_path, out, fit, replace(REQUEST, downscale=downscale), {})
         text = (tmp_path / "index.html").read_text(encoding="utf-8")
         assert re.findall(r"--detail high takes (\d+)", text) == ([] if expected is None else [str(expected)])
 

@@ -27,13 +27,13 @@ from kgs.app.files.results_folder import CHECKPOINT, check_fit_files
 from kgs.app.saved_fit import load_fit
 from kgs.app.scene_request import SceneRequest
 from kgs.datasets.synthetic import synthetic_scene
+from kgs.fit import measures
 from kgs.fit import trainer as trainer_module
 from kgs.fit.checkpoint import load_checkpoint, previous, save_checkpoint
 from kgs.fit.config import DROP, FitConfig, Recipe
 from kgs.fit.plan import with_step_defaults
 from kgs.fit.prune import prune
 from kgs.fit.trainer import Trainer
-from kgs.metrics import evaluate as measures
 
 CONFIG = FitConfig(steps=3, evaluations=1, max_gaussians=300, sh_degree=1, recipe=Recipe(grad_threshold=1e-5))
 OTHER = replace(CONFIG, seed=1)

@@ -12,11 +12,11 @@ from kornia.geometry.conversions import rotation_matrix_to_quaternion
 from kgs._support.errors import DataError
 from kgs._support.json_files import write_json
 from kgs.app import sfm
-from kgs.app.cli.unposed import is_unposed
+from kgs.app.cli.unposed import open_scene
 from kgs.app.files.outputs import write_png
 from kgs.app.files.publishing import enter
 from kgs.datasets import synthetic_scene
-from kgs.datasets.folders import nearest_scene
+from kgs.datasets.folders import scene_nearby
 from kgs.fit.config import COARSE, DETAILS
 
 SIZE = (72, 96)
@@ -176,12 +176,14 @@ def test_panoramas_that_get_too_low_are_refused_before_cameras_are_found(tmp_pat
 
 def test_photos_are_told_from_scenes(folder, tmp_path, asked):
     unposed = folder(4)
-    assert is_unposed(unposed)
-    assert not is_unposed(tmp_path / "nothing")
+    assert open_scene(unposed) is None
+    with pytest.raises(DataError, match="nothing"):
+        open_scene(tmp_path / "nothing")
     sfm.pose_photos(unposed, unposed / "out")
-    assert is_unposed(unposed)  # what kgs made of them does not count
-    assert not is_unposed(unposed / "out")
+    assert open_scene(unposed) is None  # what kgs made of them does not count
+    assert open_scene(unposed / "out").layout == "COLMAP"
     (unposed / "scene" / "sparse" / "0").mkdir(parents=True)
     shutil.copytree(unposed / "out" / "sparse", unposed / "scene" / "sparse", dirs_exist_ok=True)
-    assert nearest_scene(unposed) == unposed / "scene"
-    assert not is_unposed(unposed)
+    assert scene_nearby(unposed) == unposed / "scene"
+    with pytest.raises(DataError, match="give that folder"):
+        open_scene(unposed)

@@ -3,8 +3,9 @@
 from pathlib import Path
 
 from kgs._support.errors import DataError
-from kgs.datasets import folders
+from kgs.datasets.folders import has_photos
 from kgs.datasets.options import held_out_between_ends
+from kgs.datasets.source import SceneSource
 
 SMALLEST = 32  # pixels of the longer side of a fit's photos
 
@@ -33,17 +34,11 @@ def check_file(out: Path, ending: str, kind: str, source: Path | None = None) ->
     check_free(out.parent, kind, [out.name])
 
 
-def check_layout(scene: Path) -> None:
-    """Raise a DataError unless this is a scene."""
-    if folders.layout_of(scene) is None:
-        raise DataError(scene, "", folders.why_no_scene(scene))
-
-
-def check_scene(scene: Path) -> None:
-    """Raise a DataError unless this is a scene with at least one photo."""
-    check_layout(scene)
-    if not folders.has_photos(scene):
-        raise DataError(scene, "", "has camera poses but no photos: expected them in images/, or where its files say")
+def check_photos_of(source: SceneSource) -> None:
+    """Raise a DataError unless a scene has at least one photo."""
+    if not has_photos(source.root):
+        reason = "has camera poses but no photos: expected them in images/, or where its files say"
+        raise DataError(source.root, "", reason)
 
 
 def check_results(out: Path) -> None:

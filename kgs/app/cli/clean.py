@@ -8,7 +8,7 @@ from kgs._support.errors import DataError, printable
 from kgs.app.console import VIEWER, as_line, each, say, say_next
 from kgs.fit.config import Backend, Background
 
-from .checks import check_file, check_results, check_scene
+from .checks import check_file, check_photos_of, check_results
 from .inputs import load_cameras, load_splat
 from .options import IfGiven, Out
 from .tools import load_tools
@@ -55,11 +55,13 @@ def clean(
         backend: auto: that of the fit, or the fastest that is installed. kgs fit --help-all describes the others.
     """
     from kgs.datasets.options import check_options
+    from kgs.datasets.source import SceneSource
 
     check_options(downscale, None)
     check_file(out, ".ply", "clean", splat)
-    if cameras is not None:
-        check_scene(cameras)
+    source = None if cameras is None else SceneSource(cameras)
+    if source is not None:
+        check_photos_of(source)
     if splat.is_dir():
         for name, value in (("cameras", cameras), ("downscale", downscale)):
             if value is not None:
@@ -79,10 +81,10 @@ def clean(
     fit = None
     if splat.is_dir():
         request, fit = load_fit(splat, device, backend, say)
-        downscale = request.shrink(splat, fit.scene)
+        downscale = request.shrink(SceneSource(fit.scene.root), fit.scene)
         background = "white" if request.background == "white" else "black"
-    elif cameras is not None:
-        scene = load_cameras(cameras, downscale, photos=True, background=background)
+    elif source is not None:
+        scene = load_cameras(source, downscale, photos=True, background=background)
         fit = load_splat(splat, scene, torch_device, backend)
     if fit is not None:
         _check_some(splat, fit.model)

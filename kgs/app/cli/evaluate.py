@@ -53,7 +53,7 @@ def evaluate(
         if read_json(path) != fit.metrics:
             raise DataError(out, "", "a new fit took the place of the one that was measured: measure again")
         write_json(new / path.name, metrics)
-        write_own_page(new, out, fit.annotated(metrics=metrics), request, config=out / "config.json")
+        write_own_page(new, out, fit.annotated(metrics=metrics), request, read_json(out / "config.json"))
     say(as_text(metrics))
     say(f"{printable(path)} and {printable(out / PAGE)} are up to date")
     say_next(f"open {as_line(out / PAGE)} in a browser")

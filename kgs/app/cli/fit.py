@@ -16,10 +16,10 @@ from kgs._support.errors import DataError, printable
 from kgs.app.console import VIEWER, as_line, say, say_next
 from kgs.fit.config import COARSE, DETAILS, PRESETS, Background, FitConfig, min_side
 
-from .checks import SMALLEST, check_photos, check_roll, check_scene
+from .checks import SMALLEST, check_photos, check_photos_of, check_roll
 from .options import QUIET, IfGiven, On, Out, options_in
 from .tools import check_installed, load_tools
-from .unposed import find_scene, is_unposed, on_ctrl_c
+from .unposed import find_scene, on_ctrl_c, open_scene
 
 # The short help shows these entries of FitConfig, and all other options of the command but the rare ones.
 _OF_CONFIG = ("steps", "drop", "refine_poses", "seed", "device")
@@ -51,7 +51,7 @@ def fit(
     out: Out,
     views: IfGiven[int] = None,
     hold_out: IfGiven[int] = None,
-    size: IfGiven[int | str] = None,
+    size: Annotated[int | str | None, QUIET] = None,  # IfGiven[...] may be cached by typing as str | int
     downscale: IfGiven[float] = None,
     background: Background = "black",
     frames: IfGiven[int] = None,
@@ -106,11 +106,12 @@ def fit(
     from kgs.app.files.outputs import check_folder
     from kgs.app.files.publishing import UNFINISHED
     from kgs.app.files.results_folder import check_fit_files
-    from kgs.datasets.folders import CAMERAS_REPORT, layout_of
+    from kgs.datasets.folders import CAMERAS_REPORT
     from kgs.datasets.options import check_options
     from kgs.metrics.weights import weight_files
 
-    unposed = is_unposed(scene)
+    source = open_scene(scene)
+    unposed = source is None
     check_roll(roll)
     _check_size(size, downscale, unposed)
     if views is not None and views < 1:
@@ -122,15 +123,15 @@ def fit(
     check_folder(out, scene, make=False)
     with locked(out) if (out / UNFINISHED).is_dir() else nullcontext():
         check_fit_files(out, resume)
-    if unposed:
+    if source is None:
         check_installed("pycolmap")
         pixels = size if isinstance(size, int) else None
         shortest = min_side(config, lpips_weights is not None)
         check_photos(scene, out, views, hold_out, pixels, downscale, frames, shortest)
     else:
-        check_scene(scene)
-    if config.init == "scene" and (unposed or layout_of(scene) != "Blender"):
-        kind = "photos without camera poses" if unposed else f"the layout {layout_of(scene)}"
+        check_photos_of(source)
+    if config.init == "scene" and (source is None or source.layout != "Blender"):
+        kind = "photos without camera poses" if source is None else f"the layout {source.layout}"
         raise ValueError(f"init: expected another one for {kind}, got 'scene', Blender's points")
     load_tools(config.device, config.backend, "safetensors", "jinja2")
 
@@ -161,7 +162,6 @@ def fit(
         masks="" if masks is None else os.path.abspath(masks),
         mask_mode=mask_mode,
     )
-    base = out
     is_free = size is None and downscale is None  # the size follows from --detail
     stages = Stages(say, unposed)
     if is_free and (detail != "normal" or (unposed and config.device == "cpu")):
@@ -170,22 +170,22 @@ def fit(
             config = replace(config, coarse=COARSE)
     if preset in ("paper", "plain") and size is None and downscale is None and not unposed:
         size = "field"
-    if unposed:
+    if source is None:
         stages.begin("cameras")
         assert not isinstance(size, str)  # refused before
-        request, base = find_scene(scene, out, request, config.seed, size, frames)
+        request, source = find_scene(scene, out, request, config.seed, size, frames)
     elif (out / CAMERAS_REPORT).exists():
         raise DataError(out, "", "holds cameras that kgs found for other photos: choose another folder")
     elif size == "field":
-        photo_folder, factor, why = field_size(scene)
+        photo_folder, factor, why = field_size(source)
         say(why)
         request = replace(request, photo_folder=photo_folder, downscale=factor)
     elif isinstance(size, str):
         request = replace(request, photo_folder=size)
     elif size is not None:
-        height, width = load_scene(scene, photos=False, hold_out=hold_out).train.images.shape[-2:]
+        height, width = load_scene(source, photos=False, hold_out=hold_out).train.images.shape[-2:]
         request = replace(request, downscale=max(1.0, max(height, width) / size))
-    loaded = request.load(base, say)
+    loaded = request.load(out, say, source)
     height, width = loaded.train.images.shape[-2:]
     if max(height, width) < SMALLEST:
         reason = f"expected at least {SMALLEST} pixels, got photos of {width}x{height}"
@@ -200,7 +200,7 @@ def fit(
     posed = out if unposed else scene
     splat = published.folder / "splat.ply"
     renders = out / "renders"
-    shrink = request.shrink(base, loaded)
+    shrink = request.shrink(source, loaded)
     shrunk = ("--downscale", f"{shrink:g}") if shrink > 1.0 else ()
     say(f"{printable(splat)}: {metrics['gaussians']} Gaussians after {metrics['steps']} steps")
     if needless := left_out(published.fit.decisions):

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from kgs._support.errors import DataError, listed, printable
 from kgs.app.console import say
+from kgs.datasets.source import SceneSource
 from kgs.fit.config import Recipe
 
 if TYPE_CHECKING:
@@ -14,11 +15,11 @@ if TYPE_CHECKING:
     from kgs.fit.fit import Fit
 
 
-def load_cameras(cameras: Path, downscale: float | None, photos: bool = False, **options: Any) -> "Scene":
+def load_cameras(source: SceneSource, downscale: float | None, photos: bool = False, **options: Any) -> "Scene":
     """The scene without its photos, of which there may be hundreds, or with them; all views are training views."""
     from kgs.datasets import load_scene
 
-    scene = load_scene(cameras, None, downscale, hold_out=0, photos=photos, **options)
+    scene = load_scene(source, None, downscale, hold_out=0, photos=photos, **options)
     for note in scene.notes:
         say(note)
     return scene

@@ -8,7 +8,7 @@ from kgs._support.errors import printable
 from kgs.app.console import as_line, say, say_next
 from kgs.fit.config import Backend, Background
 
-from .checks import check_file, check_roll, check_scene
+from .checks import check_file, check_photos_of, check_roll
 from .inputs import load_cameras, load_splat
 from .options import IfGiven, On, Out
 from .tools import load_tools
@@ -49,11 +49,13 @@ def page(
         backend: auto: the fastest that is installed. kgs fit --help-all describes the others.
     """
     from kgs.datasets.options import check_options
+    from kgs.datasets.source import SceneSource
 
     check_roll(roll)
     check_options(downscale, None)
     check_file(out, ".html", "page")
-    check_scene(cameras)
+    source = SceneSource(cameras)
+    check_photos_of(source)
     torch_device = load_tools(device, backend, "jinja2")
 
     from kgs._support.machine import versions
@@ -63,13 +65,13 @@ def page(
     from kgs.losses.photometric import WINDOW
     from kgs.metrics.evaluate import evaluate
 
-    scene = load_cameras(cameras, downscale, background=background)
+    scene = load_cameras(source, downscale, background=background)
     height, width = scene.train.images.shape[-2:]
     if min(height, width) < WINDOW:
         raise ValueError(f"downscale: expected photos of at least {WINDOW} pixels a side, got {width}x{height}")
     fit = load_splat(ply, scene, torch_device, backend)
     few = spread(len(scene.train), MAX_PICTURES)
-    photographed = load_scene(cameras, len(few), downscale, hold_out=0, background=background)
+    photographed = load_scene(source, len(few), downscale, hold_out=0, background=background)
     pictured = in_frame_of(scene, photographed)
     fit = replace(fit, metrics={"views": evaluate(fit.render, pictured), "versions": versions()})
     with replacing(out.parent, "page") as new:
@@ -82,7 +84,7 @@ def page(
             notes=["Whether the splat was fitted to these photos is not known here."],
             photos=photos,
             roll=roll,
-            small=load_small(cameras, scene, background) if photos else None,
+            small=load_small(source, scene, background) if photos else None,
         )
     level = fit.metrics["views"]["psnr"]
     measured = f", PSNR {level:.4g}" if level is not None else ""

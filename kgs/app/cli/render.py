@@ -7,7 +7,6 @@ from kgs._support.errors import printable
 from kgs.app.console import VIEWER, as_line, each, say, say_next
 from kgs.fit.config import Backend, Background
 
-from .checks import check_layout
 from .inputs import load_cameras, load_splat
 from .options import IfGiven, Out
 from .tools import load_tools
@@ -43,10 +42,11 @@ def render(
     """
     from kgs.app.files.outputs import check_folder, png_names, write_png
     from kgs.datasets.options import check_options
+    from kgs.datasets.source import SceneSource
 
     check_options(downscale, None)
     check_folder(out, cameras, make=False)
-    check_layout(cameras)
+    source = SceneSource(cameras)
     torch_device = load_tools(device, backend)
 
     import torch
@@ -57,7 +57,7 @@ def render(
     from kgs.renderer import GaussianRenderer
 
     is_transparent = background == "transparent"
-    scene = load_cameras(cameras, downscale, background="black" if is_transparent else background)
+    scene = load_cameras(source, downscale, background="black" if is_transparent else background)
     fit = load_splat(ply, scene, torch_device, backend)
     renderer = GaussianRenderer(options=fit.options, backend=backend).eval()
     names = png_names(scene.train.names)

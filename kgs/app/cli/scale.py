@@ -52,6 +52,7 @@ def _scale_folder(folder: Path, out: Path, factor: float, length: float) -> None
     check_free(out, "scale", ("splat.ply", "index.html", *SPLAT_EXPORTS))
     load_tools("cpu", "auto", "jinja2", "safetensors")
 
+    from kgs._support.json_files import read_json
     from kgs.app.files.exports import write_splat_exports
     from kgs.app.page.fit_page import write_own_page
     from kgs.app.saved_fit import load_fit
@@ -65,7 +66,7 @@ def _scale_folder(folder: Path, out: Path, factor: float, length: float) -> None
     with replacing(out, "scale", all_former=True) as new:
         save_ply(new / "splat.ply", fit.model, offset=fit.scene.offset)
         write_splat_exports(fit, new, request.roll)
-        write_own_page(new, folder, fit, request, config=folder / "config.json", remarks=[note])
+        write_own_page(new, folder, fit, request, read_json(folder / "config.json"), remarks=[note])
 
 
 def _scale_ply(ply: Path, out: Path, factor: float, near: list[float]) -> None:

@@ -6,24 +6,33 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from kgs._support.errors import DataError
 from kgs.app.console import each, say
-from kgs.datasets.folders import VIDEO_SUFFIXES, nearest_scene
+from kgs.datasets.folders import VIDEO_SUFFIXES, layout_of, scene_nearby, why_no_scene
+from kgs.datasets.source import SceneSource
 
 if TYPE_CHECKING:
     from kgs.app.scene_request import SceneRequest
 
 
-def is_unposed(scene: Path) -> bool:
-    """Whether this is a video, or a folder that is no scene and has none right below or above it."""
-    if scene.is_file():
-        return scene.suffix.lower() in VIDEO_SUFFIXES
-    return scene.is_dir() and nearest_scene(scene) is None
+def open_scene(path: Path) -> SceneSource | None:
+    """A scene; None: a video, or a folder of unposed photos, which is no scene and has none right below or above it.
+
+    Raises:
+        DataError: it is none of these.
+    """
+    if layout := layout_of(path):
+        return SceneSource(path, layout)
+    is_video = path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
+    if is_video or (path.is_dir() and scene_nearby(path) is None):
+        return None
+    raise DataError(path, "", why_no_scene(path))
 
 
 def find_scene(
     photos: Path, out: Path, request: "SceneRequest", seed: int, size: int | None = None, frames: int | None = None
-) -> "tuple[SceneRequest, Path]":
-    """Find the cameras of unposed photos; returns how to load the scene, and the folder it is in.
+) -> "tuple[SceneRequest, SceneSource]":
+    """Find the cameras of unposed photos; returns how to load the scene, and its folder.
 
     The folder is `out`, or one in it until the new fit takes the place of a former one: see `pose_photos`.
 
@@ -63,7 +72,7 @@ def find_scene(
         title=request.title or in_plain_words(video.stem if video else photos.resolve().name),
         masks="",  # they are beside the copies of the photos
     )
-    return loaded_as, Path(report["folder"])
+    return loaded_as, SceneSource(report["folder"])
 
 
 @contextmanager

@@ -64,7 +64,7 @@ def png_names(views: Iterable[str]) -> dict[str, str]:
 
 
 def write_png(path: Path, image: "Tensor") -> None:
-    """Write an RGB or RGBA image `(3 or 4, H, W)`, clamped to [0, 1] and rounded to 8 bits.
+    """Write an RGB or RGBA image `(3 or 4, H, W)`: of 8 bits, or clamped to [0, 1] and rounded to 8 bits.
 
     Alpha is straight, as PNG has it: the colours are not multiplied by it.
     """

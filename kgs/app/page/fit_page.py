@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from kgs.app.scene_request import SceneRequest
 from kgs.datasets.folders import CAMERAS_REPORT
 from kgs.datasets.load import load_scene
 from kgs.datasets.scene import Scene, Views
+from kgs.datasets.source import SceneSource
 from kgs.datasets.splits import select_evenly
 from kgs.fit.decisions import Decisions
 from kgs.fit.fit import Fit
@@ -118,18 +118,18 @@ def write_fit_page(
     return write_page(path, content)
 
 
-def load_small(path: str | PathLike[str], scene: Scene, background: str) -> Views:
+def load_small(source: SceneSource, scene: Scene, background: str) -> Views:
     """Load the photos of the strip of thumbnails, in a small size.
 
     Args:
-        path: the folder of the scene.
+        source: the folder of the scene.
         scene: the scene without its photos; all views are training views.
         background: "black" or "white".
     """
     count = len(in_strip(scene.train.names))
-    whole = load_scene(path, count, hold_out=0, photos=False).train
+    whole = load_scene(source, count, hold_out=0, photos=False).train
     shrink = max(1.0, min(whole.images.shape[-2:]) / _SMALL_PIXELS)
-    return load_scene(path, count, shrink, hold_out=0, background=background).train
+    return load_scene(source, count, shrink, hold_out=0, background=background).train
 
 
 def write_own_page(
@@ -137,7 +137,7 @@ def write_own_page(
     out: Path,
     fit: Fit,
     request: SceneRequest,
-    config: Path | None = None,
+    settings: Mapping[str, Any],
     remarks: Sequence[str] = (),
 ) -> None:
     """Write the page of a fit into a folder that has its other files.
@@ -147,7 +147,7 @@ def write_own_page(
         out: where the files of the fit belong.
         fit: with metrics.
         request: how the scene was loaded.
-        config: config.json of the fit; None: that in `folder`.
+        settings: the content of config.json.
         remarks: sentences to show under Details.
     """
     write_fit_page(
@@ -155,7 +155,7 @@ def write_own_page(
         request.title_of(out),
         {"": fit},
         remarks=[*remarks, *_finer_note(fit.scene, request)],
-        settings=read_json(config or folder / "config.json"),
+        settings=settings,
         report=fit.scene.root / CAMERAS_REPORT,
         photos=request.photos,
         roll=request.roll,

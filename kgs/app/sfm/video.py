@@ -85,7 +85,7 @@ def take_frames(
             if pixels is None:
                 raise DataError(video, "", f"frame {index} cannot be read a second time")
             paths.append(folder / f"frame_{index:05d}.png")
-            write_png(paths[-1], torch.from_numpy(pixels[..., ::-1].copy()).permute(2, 0, 1) / 255)
+            write_png(paths[-1], torch.from_numpy(pixels[..., ::-1].copy()).permute(2, 0, 1))
     say(f"{video.name}: {len(paths)} frames, {way / (len(paths) - 1):.0f} degrees apart in the mean")
     return paths
 

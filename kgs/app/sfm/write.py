@@ -24,7 +24,7 @@ def write_images(folder: Path, photos: list[Photo], names: list[str], opaque: bo
     """Write the photos, or these over black, as PNGs without metadata: another JPEG compression would lose detail."""
     for photo, name in zip(photos, names, strict=True):
         pixels = photo.opaque() if opaque else photo.pixels
-        write_png(folder / name, torch.from_numpy(np.ascontiguousarray(pixels)).permute(2, 0, 1) / 255)
+        write_png(folder / name, torch.from_numpy(np.ascontiguousarray(pixels)).permute(2, 0, 1))
 
 
 def write_masks(folder: Path, photos: list[Photo], names: list[str]) -> None:
@@ -36,9 +36,8 @@ def write_masks(folder: Path, photos: list[Photo], names: list[str]) -> None:
         return
     folder.mkdir()
     for photo, name in zip(photos, names, strict=True):
-        white = torch.ones(3, *photo.pixels.shape[:2])
-        kept = white if photo.mask is None else white * torch.from_numpy(np.ascontiguousarray(photo.mask)) / 255
-        write_png(folder / f"{name}.png", kept)
+        kept = np.full(photo.pixels.shape[:2], 255, np.uint8) if photo.mask is None else photo.mask
+        write_png(folder / f"{name}.png", torch.from_numpy(np.ascontiguousarray(kept)).expand(3, -1, -1))
 
 
 def upright(cameras: Cameras, turned: set[str], names: Mapping[str, str]) -> Cameras:
