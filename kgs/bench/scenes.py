@@ -74,7 +74,7 @@ def cast(scene: Scene, dtype: torch.dtype) -> Scene:
 def gradients(image: Tensor, gaussians: Gaussians) -> dict[str, Tensor]:
     """Those of a sum of the pixels with random weights, which are the same for all images of one size."""
     generator = torch.Generator().manual_seed(0)
-    weights = torch.randn(image.shape, generator=generator, dtype=torch.float64).to(image.dtype)
+    weights = torch.randn(image.shape, generator=generator, dtype=torch.float64).to(image)
     slopes = torch.autograd.grad((image * weights).sum(), [getattr(gaussians, name) for name in PARAMETERS])
     return dict(zip(PARAMETERS, slopes, strict=True))
 

@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from kgs import backends
+from kgs import Gaussians, backends
 from kgs.bench import check
+from kgs.bench.scenes import gradients
 
 
 @pytest.fixture(autouse=True)
@@ -54,3 +55,11 @@ def test_what_is_not_installed_is_no_failure(monkeypatch, capsys):
 def test_apples_gpus_are_answered_in_a_line(capsys):
     assert check.check(device="mps") == 0
     assert capsys.readouterr().out.startswith("kgs: Apple's GPUs have no Triton")
+
+
+def test_gradients_are_taken_on_the_device_of_the_image():
+    shapes = ((4, 3), (4, 4), (4, 3), (4,), (4, 3))
+    gaussians = Gaussians(*(torch.empty(shape, device="meta", requires_grad=True) for shape in shapes))
+    image = sum(value.sum() for value in vars(gaussians).values()).expand(1, 3, 8, 8)
+    slopes = gradients(image, gaussians)
+    assert {slope.device.type for slope in slopes.values()} == {"meta"}
