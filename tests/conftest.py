@@ -13,6 +13,7 @@ import pytest
 import torch
 from hypothesis import settings
 from init_point_scenes import painted_planes
+from optional_packages import pytest_pycollect_makemodule  # noqa: F401
 from tables import pytest_addoption, pytest_configure, pytest_terminal_summary  # noqa: F401  # --tables
 
 from kgs import backends
