@@ -63,14 +63,3 @@ def test_a_table_without_a_scene_names_the_folder(data):
     with pytest.raises(DataError, match="Mip-NeRF 360") as error:
         cells_of_table(cells, 2, data)
     assert error.value.path == data / "colmap"
-
-
-@pytest.mark.parametrize("table", [0, 7])
-def test_a_table_that_is_not_there(data, table):
-    with pytest.raises(ValueError, match=f"^table: .* got {table}$"):
-        cells_of_table(presets.sparse_cells("paper", data), table, data)
-
-
-def test_a_table_of_another_preset_is_refused_before_any_work(tmp_path):
-    with pytest.raises(ValueError, match=r"^table: .*'paper'.*'quick'"):
-        study(out=tmp_path, table=1)
