@@ -26,6 +26,7 @@ from kornia.sensors.camera import CameraModelType
 import kgs
 import kgs.reference
 from kgs.camera import image_size
+from kgs.compressed_ply import save_compressed_ply
 from kgs.densify import Densifier
 from kgs.losses import photometric_loss, target_moments
 from kgs.ply import load_ply, save_ply
@@ -297,6 +298,10 @@ CASES = [
         ("offset", ValueError, lambda wrong=wrong: save_ply("no.ply", random_model(), wrong))
         for wrong in (torch.zeros(1, 3), torch.tensor([0.0, NAN, 0.0]))
     ],
+    ("model", TypeError, lambda: save_ply("no.ply", random_model()())),
+    ("model", TypeError, lambda: save_compressed_ply("no.ply", random_model()())),
+    ("model", ValueError, lambda: save_compressed_ply("no.ply", random_model(0))),
+    ("offset", ValueError, lambda: save_compressed_ply("no.ply", random_model(), torch.zeros(2))),
     *[
         ("origin", ValueError, lambda wrong=wrong: load_ply("no.ply", wrong))
         for wrong in (torch.zeros(1, 3), torch.tensor([0.0, NAN, 0.0]))
