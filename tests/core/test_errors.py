@@ -4,6 +4,7 @@ import dataclasses
 import math
 import re
 
+import numpy as np
 import pytest
 import torch
 from densifiers import SMALL, seen
@@ -119,6 +120,12 @@ def drop_at(factor):
     drop_layer(0.5, p=0.2, schedule=lambda progress: factor)(torch.ones(5))
 
 
+def drop_by_later_rates(rates):
+    layer = drop_layer(1.0)
+    layer.p = rates
+    layer(torch.ones(2))
+
+
 def drawn_by_the_reference(seen=None, background=None, **changes):
     gaussians = with_fields(random_gaussians(3, 0, torch.float32), **changes)
     return kgs.reference.render(gaussians, camera() if seen is None else seen, background)
@@ -149,6 +156,7 @@ def densifier_with(optimizer):
 
 NAN = math.nan
 INF = math.inf
+BAD_RATES = [torch.tensor(rates) for rates in ([0.5, 1.0], [-0.1, 0.5], [0.5, NAN])]
 CASES = [
     # options
     *bad_options("tile_size", 0, 8.0, 8.5, True),
@@ -246,9 +254,21 @@ CASES = [
     ("target", ValueError, lambda: target_moments(torch.zeros(2, 3, 16, 5))),
     # the layer
     *bad_layer("p", -0.1, 1, 1.0, 1.5, INF, -INF, NAN, "0.2", None),
+    *bad_layer("p", *BAD_RATES),
     *[
-        ("p", ValueError, lambda training=training: kgs.drop_gaussian(torch.ones(5), 1.0, training=training))
-        for training in (True, False)
+        ("p", ValueError, lambda rate=rate, on=on: kgs.drop_gaussian(torch.ones(2), rate, training=on))
+        for rate in (1.0, *BAD_RATES)
+        for on in (True, False)
+    ],
+    *[("p * schedule(progress)", ValueError, lambda rates=rates: drop_by_later_rates(rates)) for rates in BAD_RATES],
+    *[
+        ("p", ValueError, lambda shape=shape, n=n: kgs.drop_gaussian(torch.ones(shape), torch.full((n,), 0.5)))
+        for shape, n in (((5,), 4), ((3, 5), 3), ((5, 1), 4), ((), 4), ((5, 4, 1), 5))
+    ],
+    *[
+        ("schedule", ValueError, lambda ones=ones, shape=shape: drop_at(ones(shape)))
+        for ones in (torch.ones, np.ones)
+        for shape in ((4,), (0,), (2, 2))
     ],
     *[
         ("opacities", TypeError, lambda seed=seed, wrong=wrong: drop_layer(1.0, p=0.5, seed=seed)(wrong))

@@ -63,6 +63,7 @@ CASES = [
         ("table", ValueError, lambda folder, table=table: cells_of_table([tiny_cell()], table, folder))
         for table in (0, 7)
     ],
+    ("FOLDER/colmap", DataError, lambda folder: cells_of_table([tiny_cell()], 2, folder)),  # has no scene of the table
     ("table", ValueError, lambda folder: study(out=folder, table=1)),
     ("opacities", ValueError, lambda _: opacity_l1(torch.rand(3, 1), torch.rand(3, 1))),
     ("scores", ValueError, lambda _: opacity_l1(torch.rand(3), torch.rand(4))),
