@@ -62,10 +62,11 @@ def test_a_package_that_is_missing_is_named_before_any_work(package, tmp_path, m
 def test_each_cell_is_there_once_and_is_a_fit(preset, guarded):
     cells = sparse_cells(preset, guarded)
     assert len({json.dumps(cell, sort_keys=True) for cell in cells}) == len(cells)
-    for cell in cells:
-        fit, _ = cells_module._split({key: value for key, value in cell["fit"].items() if key != "preset"})
+    for method, settings in {cell["method"]: cell["fit"] for cell in cells}.items():
+        assert all(cell["fit"] == settings for cell in cells if cell["method"] == method)
+        fit, _ = cells_module._split({key: value for key, value in settings.items() if key != "preset"})
         config = FitConfig.from_dict(FitConfig().to_dict() | fit)
-        assert config.drop == METHODS[cell["method"]].get("drop", FitConfig().drop)
+        assert config.drop == METHODS[method].get("drop", FitConfig().drop)
 
 
 def settings(cells):

@@ -149,8 +149,18 @@ SCENES = {
 }
 
 
-def test_the_headline_has_both_intervals_of_psnr_and_lpips():
-    lines = {(line[""], line["measure"]): line for line in headline(cells_of(SCENES))}
+@pytest.fixture(scope="module")
+def frame():
+    return cells_of(SCENES)
+
+
+@pytest.fixture(scope="module")
+def sentences(frame):
+    return findings(frame)
+
+
+def test_the_headline_has_both_intervals_of_psnr_and_lpips(frame, sentences):
+    lines = {(line[""], line["measure"]): line for line in headline(frame)}
     what = "The default (auto) over the paper's rule (progressive 0.2)"
     differences = np.array([[1.012, 0.5], [-0.36, -0.6]])  # fern, fox
     means = differences.mean(1)
@@ -165,7 +175,7 @@ def test_the_headline_has_both_intervals_of_psnr_and_lpips():
         assert (line["scenes"], line["pairs"]) == ("2", "4")
         assert line["llff/fern"].startswith(f"{factor * means[0]:+.{decimals}f} [")
         assert line["nerfstudio/fox"].startswith(f"{factor * means[1]:+.{decimals}f} [")
-        sentence = next(text for text in findings(cells_of(SCENES)) if text.startswith(what))
+        sentence = next(text for text in sentences if text.startswith(what))
         assert f"{measure} {mean} [{a}, {b}] over scenes, [{c}, {d}] over seeds" in sentence
     only = lines["Dropping in the default (auto over auto, off)", "PSNR [dB]"]
     half = student(1) * np.std([0.512, 0.3], ddof=1) / math.sqrt(2)
@@ -173,15 +183,14 @@ def test_the_headline_has_both_intervals_of_psnr_and_lpips():
     assert (only["scenes"], only["nerfstudio/fox"]) == ("1", "-")
 
 
-def test_regret_is_against_the_best_other_method_of_each_scene():
-    frame = cells_of(SCENES)
+def test_regret_is_against_the_best_other_method_of_each_scene(frame, sentences):
     lines = {(line["scene"], line["measure"]): [*line.values()][2:] for line in regret(frame)}
     assert lines["llff/fern", "PSNR [dB]"][:2] == ["auto, off", "3"]
     assert lines["llff/fern", "PSNR [dB]"][2].startswith("+0.41 [")
     assert lines["nerfstudio/fox", "PSNR [dB]"][:2] == ["progressive 0.2", "2"]
     assert lines["nerfstudio/fox", "PSNR [dB]"][2].startswith("-0.48 [")
     assert lines["llff/fern", "LPIPS (less is better)"][0] == "off"  # the least
-    sentence = next(text for text in findings(frame) if "best other method" in text)
+    sentence = next(text for text in sentences if "best other method" in text)
     assert "-0.04 dB in the mean of 2 scenes, at worst -0.48 [" in sentence
     assert "on nerfstudio/fox (over progressive 0.2)" in sentence
     assert regret(cells_of({("llff/fern", 3, "off"): [1.0]})) == []
