@@ -92,7 +92,7 @@ def test_rng_state_continues_the_stream_in_another_layer(calls_before):
     assert torch.equal(stream(layer), expected)
 
 
-@pytest.mark.parametrize("context", ["fork", "spawn"])
+@pytest.mark.parametrize("context", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
 def test_a_worker_of_a_data_loader_continues_the_stream(context):
     layer = at(1.0, p=0.5, seed=3)
     stream(layer)
