@@ -1,4 +1,4 @@
-"""Footprints against exact rational arithmetic and 40-digit arithmetic; rotations against the matrix exponential."""
+"""Footprints against exact rational arithmetic and 40-digit arithmetic; rotations against SciPy's."""
 
 import itertools
 import math
@@ -8,6 +8,7 @@ import mpmath
 import pytest
 import torch
 from mpmath import mpf
+from scipy.spatial.transform import Rotation
 
 from kgs.covariance import conics, footprint_factors, rotation_matrices, variances, whitening
 
@@ -26,20 +27,16 @@ def dense(factors, eps2d=EPS2D):
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 7e-7), (torch.float64, 1e-14)])
-def test_rotation_is_the_exponential_of_the_axis_times_the_angle(dtype, tolerance):
-    axis = torch.nn.functional.normalize(normal(100, 3), dim=1)
-    angle = torch.linspace(-3.2, 3.2, 100, dtype=torch.float64)[:, None]
-    quats = torch.cat([torch.cos(angle / 2), torch.sin(angle / 2) * axis], 1)
-    eye = torch.eye(3, dtype=torch.float64)
-    turning = torch.linalg.cross((angle * axis)[:, None].expand(-1, 3, 3), eye.expand(100, 3, 3)).mT
-    expected = torch.linalg.matrix_exp(turning)
+def test_rotations_are_scipys_and_orthonormal(dtype, tolerance):
+    quats = normal(100, 4)
+    expected = torch.from_numpy(Rotation.from_quat(quats.roll(-1, 1).numpy()).as_matrix())
     got = rotation_matrices((quats * normal(100, 1, seed=1).exp()).to(dtype)).double()
     torch.testing.assert_close(got, expected, rtol=0, atol=tolerance)
-    torch.testing.assert_close(got.mT @ got, eye.expand(100, 3, 3), rtol=0, atol=2 * tolerance)
-    torch.testing.assert_close(torch.linalg.det(got), torch.ones(100, dtype=torch.float64), rtol=0, atol=2 * tolerance)
+    torch.testing.assert_close(got.mT @ got, torch.eye(3).to(got).expand(100, 3, 3), rtol=0, atol=2 * tolerance)
+    torch.testing.assert_close(torch.linalg.det(got), torch.ones(100).to(got), rtol=0, atol=2 * tolerance)
 
 
-@pytest.mark.parametrize("norm", [1e-30, 1e-20, 1e-12, 1e-6, 3.0, 1e12, 1e20, 1e30])
+@pytest.mark.parametrize("norm", [1e-30, 1e-12, 3.0, 1e12, 1e30])
 def test_the_norm_does_not_matter(norm):
     quats = normal(50, 4, dtype=torch.float32)
     torch.testing.assert_close(rotation_matrices(quats * norm), rotation_matrices(quats), rtol=0, atol=6e-7)

@@ -70,26 +70,39 @@ def test_the_size_limit_itself_is_cloned_and_the_largest_axis_decides():
 
 X = (1, 0)
 BELOW = (math.nextafter(0.5, 0) - 1e-7, 0)
+FAINT = 0.001
 RULES = {  # scales, opacities, options, who was seen, with which gradients; cloned, split, pruned, total, capped
     "the threshold itself": ([SMALL] * 2, None, {"grad_threshold": 0.5}, [0, 1], [(0.5, 0), BELOW], (1, 0, 0, 3, 0)),
     "norms, not vectors": ([SMALL], None, {"grad_threshold": 0.9}, [0, 0], [X, (-1, 0)], (1, 0, 0, 2, 0)),
+    "one without gradient is seen": ([SMALL], None, {"grad_threshold": 0.6}, [0, 0], [X, (0, 0)], (0, 0, 0, 1, 0)),
+    "others do not count": ([SMALL] * 2, None, {"grad_threshold": 0.6}, [0], [X], (1, 0, 0, 3, 0)),
     "all at once": (
         [SMALL, SMALL, LARGE, LARGE, SMALL],
-        [0.5, 0.5, 0.5, 0.5, 0.001],
+        [0.5, 0.5, 0.5, 0.5, FAINT],
         {},
         [0, 1, 2, 3],
         [X, (0, 0), X, (0, 0)],
         (1, 1, 1, 6, 0),
     ),
+    "transparent ones go, whatever their gradient": (
+        [SMALL, LARGE, SMALL, LARGE],
+        [0.004, 0.004, 0.006, 0.004],
+        {},
+        [0, 1],
+        [X, X],
+        (0, 0, 3, 1, 0),
+    ),
     "room made by pruning counts towards the cap, and a split adds one": (
         [LARGE, LARGE, LARGE, SMALL],
-        [0.5, 0.5, 0.5, 0.001],
+        [0.5, 0.5, 0.5, FAINT],
         {"max_gaussians": 5},
         [0, 1, 2],
         [X, (3, 0), (2, 0)],
         (0, 2, 1, 5, 1),
     ),
     "a model over the cap is not cut": ([SMALL] * 4, None, {"max_gaussians": 2}, [0], [X], (0, 0, 0, 4, 1)),
+    "nothing is seen": ([SMALL] * 3, None, {}, [], [], (0, 0, 0, 3, 0)),
+    "all may go": ([SMALL] * 2, [FAINT] * 2, {}, [], [], (0, 0, 2, 0, 0)),
 }
 
 
@@ -97,17 +110,13 @@ RULES = {  # scales, opacities, options, who was seen, with which gradients; clo
 def test_rules(name):
     scales, opacities, options, ids, gradients, expected = RULES[name]
     model, _, densifier = make(scales, opacities, **options)
-    densifier.observe(seen(model, ids, gradients))
+    projected = seen(model, ids, gradients)
+    if not ids:
+        projected.means2d.grad = None  # as after a render that saw nothing
+    densifier.observe(projected)
     assert densifier.step() == DensifyReport(*expected)
     assert {len(parameter) for parameter in model.parameters()} == {expected[3]}
-
-
-def test_transparent_gaussians_are_pruned_even_when_their_gradient_is_large():
-    model, _, densifier = make([SMALL, LARGE, SMALL, LARGE], [0.004, 0.004, 0.006, 0.004])
-    keep = model.means[2].clone()
-    densifier.observe(seen(model, [0, 1], [(1, 0), (1, 0)]))
-    assert densifier.step() == DensifyReport(cloned=0, split=0, pruned=3, total=1, capped=0)
-    assert torch.equal(model.means[0], keep)
+    assert densifier.step() == DensifyReport(0, 0, 0, expected[3], 0), "statistics begin anew"
 
 
 def test_gradients_are_in_normalised_device_coordinates():
@@ -117,15 +126,6 @@ def test_gradients_are_in_normalised_device_coordinates():
     densifier.observe(seen(model, [0, 1, 2, 3], [(3, 0), (2.9, 0), (0, 20), (0, 19.9)], image_size=(6, 40)))
     densifier.step()
     assert torch.equal(model.means[4:], means[[0, 2]])
-
-
-def test_a_dropped_gaussian_counts_as_seen_and_an_unseen_one_does_not():
-    model, _, densifier = make([SMALL] * 3, grad_threshold=0.6)
-    densifier.observe(seen(model, [0, 1], [(1, 0), (1, 0)]))
-    densifier.observe(seen(model, [0], [(0, 0)]))  # dropped in this render: listed, without gradient
-    kept = model.means[1].clone()
-    assert densifier.step().cloned == 1  # 0: 1/2 < 0.6; 1: 1/1
-    assert torch.equal(model.means[3], kept)
 
 
 def test_the_mean_over_cameras_is_undone():
@@ -140,26 +140,12 @@ def test_the_mean_over_cameras_is_undone():
     assert densifier.step().cloned == 1
 
 
-def test_statistics_begin_anew_after_a_step_and_fresh_clones_wait():
-    model, _, densifier = make([SMALL])
-    densifier.observe(seen(model, [0], [(1, 0)]))
-    assert densifier.step().total == 2
-    assert densifier.step() == DensifyReport(cloned=0, split=0, pruned=0, total=2, capped=0)
-
-
 def test_the_cap_takes_the_largest_gradients_and_ties_by_position():
     model, _, densifier = make([SMALL] * 6, max_gaussians=9)
     means = model.means.detach().clone()
     densifier.observe(seen(model, [0, 1, 2, 3, 4], [(1, 0), (3, 0), (1, 0), (2, 0), (1, 0)]))
     assert densifier.step() == DensifyReport(cloned=3, split=0, pruned=0, total=9, capped=2)
     assert torch.equal(model.means[6:], means[[0, 1, 3]])
-
-
-def test_all_may_go():
-    model, _, densifier = make([SMALL] * 2, [0.001] * 2)
-    assert densifier.step() == DensifyReport(cloned=0, split=0, pruned=2, total=0, capped=0)
-    assert model().colors.shape == (0, 9, 3)
-    assert densifier.step().total == 0
 
 
 @pytest.mark.parametrize("log_scale", [-100.0, -44.0, 44.0, 88.0, 89.0, 1000.0])
@@ -171,14 +157,6 @@ def test_extreme_scales_and_opacities_stay_finite(log_scale):
     densifier.observe(seen(model, [0, 1, 2], [(1, 0)] * 3))
     assert densifier.step().total == 6
     assert all(bool(torch.isfinite(parameter).all()) for parameter in model.parameters())
-
-
-def test_a_render_that_saw_nothing_is_no_error():
-    model, _, densifier = make([SMALL] * 3)
-    projected = seen(model, [], [])
-    projected.means2d.grad = None
-    densifier.observe(projected)
-    assert densifier.step().total == 3
 
 
 # -- the mean gradients that scores are made of --------------------------------------------------------------------
@@ -198,33 +176,28 @@ def test_mean_gradients_go_on_through_a_step_and_children_inherit_them():
     assert densifier.mean_gradients.tolist() == pytest.approx([1.6 / 3, 0.45 / 2, 1.6 / 3, 1.8 / 3, 1.8 / 3])
 
 
-def test_decay_multiplies_opacities():
+# -- decay ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rows", [None, torch.arange(50) % 3 == 0], ids=["all", "some rows"])
+def test_decay_multiplies_opacities_in_place_and_leaves_others_their_bits(rows):
     model = random_model(50, 0)
     with torch.no_grad():
         model.opacity_logits[:4] = torch.tensor([30.0, -30.0, math.inf, -math.inf])
-    densifier = Densifier(model, torch.optim.Adam(model.parameters()), 1.0)
-    before = model.opacity_logits.detach().double().sigmoid()
-    parameter = model.opacity_logits
-    densifier.decay_opacity(0.99)
-    assert model.opacity_logits is parameter
-    np.testing.assert_allclose(model.opacity_logits.detach().double().sigmoid(), 0.99 * before, rtol=2e-6)
-
-
-def test_decay_of_some_rows_leaves_the_others_their_bits():
-    model = random_model(6, 0)
-    rows = torch.tensor([True, False, False, True, False, False])
     before = model.opacity_logits.detach().clone()
-    Densifier(model, torch.optim.Adam(model.parameters()), 1.0).decay_opacity(0.5, rows)
-    assert torch.equal(model.opacity_logits[~rows], before[~rows])
-    np.testing.assert_allclose(model.opacity_logits[rows].detach().sigmoid(), 0.5 * before[rows].sigmoid(), rtol=1e-5)
+    parameter = model.opacity_logits
+    Densifier(model, torch.optim.Adam(model.parameters()), 1.0).decay_opacity(0.99, rows)
+    assert model.opacity_logits is parameter
+    rows = torch.ones(50, dtype=torch.bool) if rows is None else rows
+    assert torch.equal(parameter[~rows], before[~rows])
+    decayed = parameter[rows].detach().double().sigmoid()
+    np.testing.assert_allclose(decayed, 0.99 * before[rows].double().sigmoid(), rtol=2e-6)
 
 
-def test_gaussians_that_are_all_pruned_can_decay():
-    model = random_model(5, 0)
-    with torch.no_grad():
-        model.opacity_logits.fill_(-30.0)
-    densifier = Densifier(model, torch.optim.Adam(model.parameters()), 1.0)
-    assert densifier.step().total == 0
+def test_a_model_without_gaussians_goes_through_everything():
+    model, _, densifier = make([SMALL], [0.001])
+    densifier.step()
+    assert model().colors.shape == (0, 9, 3)
     densifier.decay_opacity(0.99)
     densifier.reset_opacity()
-    assert len(model) == 0
+    assert densifier.step().total == 0

@@ -1,9 +1,11 @@
 """What the core and its stages refuse: the type of the error, and the name that its message begins with."""
 
 import dataclasses
+import functools
 import math
 import re
 
+import numpy as np
 import pytest
 import torch
 from densifiers import SMALL, seen
@@ -26,22 +28,28 @@ from kornia.sensors.camera import CameraModelType
 import kgs
 import kgs.reference
 from kgs.camera import image_size
+from kgs.compressed_ply import save_compressed_ply
 from kgs.densify import Densifier
 from kgs.losses import photometric_loss, target_moments
 from kgs.ply import load_ply, save_ply
 
 
+def each(name, error, call, *values):
+    """A case for each of these values."""
+    return [(name, error, functools.partial(call, value)) for value in values]
+
+
 def bad_options(name, *values):
     """The renderer's options are checked where they are made."""
-    return [(name, ValueError, lambda value=value: kgs.RasterOptions(**{name: value})) for value in values]
+    return each(name, ValueError, lambda value: kgs.RasterOptions(**{name: value}), *values)
 
 
 def bad_densifier(name, *values):
-    return [(name, ValueError, lambda value=value: make([SMALL], **{name: value})) for value in values]
+    return each(name, ValueError, lambda value: make([SMALL], **{name: value}), *values)
 
 
 def bad_layer(name, *values):
-    return [(name, ValueError, lambda value=value: kgs.DropGaussian(**{name: value})) for value in values]
+    return each(name, ValueError, lambda value: kgs.DropGaussian(**{name: value}), *values)
 
 
 def bad_points(name, error, points, colors=None):
@@ -109,6 +117,14 @@ def camera_of_another_dtype():
     return posed(CameraModelType.PINHOLE, [9.0, 9.0, 6.0, 4.0], (24, 32), extrinsics=torch.eye(4)[None])
 
 
+def camera_with_extrinsics(shape):
+    posed(CameraModelType.PINHOLE, extrinsics=torch.zeros(shape))
+
+
+def saved_with_degree(degree):
+    save_ply("no.ply", random_model(sh_degree=1), sh_degree=degree)
+
+
 def drawn_with_rows_of_opacities(rows, cameras):
     gaussians = dataclasses.replace(random_gaussians(3, 0, torch.float32), opacities=torch.full((rows, 3), 0.5))
     kgs.GaussianRenderer()(gaussians, batch(*[camera()] * cameras))
@@ -116,6 +132,12 @@ def drawn_with_rows_of_opacities(rows, cameras):
 
 def drop_at(factor):
     drop_layer(0.5, p=0.2, schedule=lambda progress: factor)(torch.ones(5))
+
+
+def drop_by_later_rates(rates):
+    layer = drop_layer(1.0)
+    layer.p = rates
+    layer(torch.ones(2))
 
 
 def drawn_by_the_reference(seen=None, background=None, **changes):
@@ -148,6 +170,8 @@ def densifier_with(optimizer):
 
 NAN = math.nan
 INF = math.inf
+BAD_RATES = [torch.tensor(rates) for rates in ([0.5, 1.0], [-0.1, 0.5], [0.5, NAN])]
+BAD_VECTORS = [torch.zeros(1, 3), torch.tensor([0.0, NAN, 0.0])]
 CASES = [
     # options
     *bad_options("tile_size", 0, 8.0, 8.5, True),
@@ -182,28 +206,16 @@ CASES = [
     ("cameras", TypeError, lambda: kgs.project(random_gaussians(3, 0, torch.float32).to("meta"), camera())),
     bad_argument("gaussians", TypeError, None),
     ("gaussians", TypeError, lambda: kgs.project([random_gaussians(3, 0)], camera())),
-    *[
-        ("opacities", ValueError, lambda shape=shape: drawn_with_rows_of_opacities(*shape))
-        for shape in ((2, 1), (1, 3), (2, 3))
-    ],
+    *each("opacities", ValueError, lambda shape: drawn_with_rows_of_opacities(*shape), (2, 1), (1, 3), (2, 3)),
     # cameras
-    *[("cameras", TypeError, lambda wrong=wrong: image_size(wrong)) for wrong in (None, torch.eye(4))],
+    *each("cameras", TypeError, image_size, None, torch.eye(4)),
     ("cameras", TypeError, lambda: image_size(camera_of_another_dtype().model)),
     ("cameras", ValueError, lambda: image_size(batch(pinhole(4, 6, 9.0), pinhole(5, 6, 9.0)))),
     ("cameras", ValueError, lambda: image_size(pinhole(0, 64, 9.0))),
-    *[
-        ("extrinsics", ValueError, lambda shape=shape: kgs.camera_extent(torch.zeros(shape)))
-        for shape in ((4, 4), (0, 4, 4), (2, 3, 4))
-    ],
-    *[
-        ("model", TypeError, lambda wrong=wrong: kgs.PosedCamera(wrong, torch.eye(4)[None]))
-        for wrong in (camera(), None)
-    ],
+    *each("extrinsics", ValueError, lambda shape: kgs.camera_extent(torch.zeros(shape)), (4, 4), (0, 4, 4), (2, 3, 4)),
+    *each("model", TypeError, lambda wrong: kgs.PosedCamera(wrong, torch.eye(4)[None]), camera(), None),
     ("extrinsics", TypeError, lambda: posed(CameraModelType.PINHOLE, extrinsics=torch.eye(4)[None].tolist())),
-    *[
-        ("extrinsics", ValueError, lambda shape=shape: posed(CameraModelType.PINHOLE, extrinsics=torch.zeros(shape)))
-        for shape in ((4, 4), (1, 3, 4), (1, 1, 4, 4))
-    ],
+    *each("extrinsics", ValueError, camera_with_extrinsics, (4, 4), (1, 3, 4), (1, 1, 4, 4)),
     ("model", ValueError, lambda: posed(CameraModelType.PINHOLE, torch.ones(2, 4).double(), cameras=3)),
     # gsplat's call
     *[bad_call_of_gsplat(name, None) for name in (*FIELDS, "viewmats", "Ks")],
@@ -245,10 +257,25 @@ CASES = [
     ("target", ValueError, lambda: target_moments(torch.zeros(2, 3, 16, 5))),
     # the layer
     *bad_layer("p", -0.1, 1, 1.0, 1.5, INF, -INF, NAN, "0.2", None),
+    *bad_layer("p", *BAD_RATES),
+    *each("p", ValueError, lambda rate: kgs.drop_gaussian(torch.ones(2), rate), 1.0, *BAD_RATES),
+    *each("p", ValueError, lambda rate: kgs.drop_gaussian(torch.ones(2), rate, training=False), 1.0, *BAD_RATES),
+    *each("p * schedule(progress)", ValueError, drop_by_later_rates, *BAD_RATES),
     *[
-        ("p", ValueError, lambda training=training: kgs.drop_gaussian(torch.ones(5), 1.0, training=training))
-        for training in (True, False)
+        ("p", ValueError, lambda shape=shape, n=n: kgs.drop_gaussian(torch.ones(shape), torch.full((n,), 0.5)))
+        for shape, n in (((5,), 4), ((3, 5), 3), ((5, 1), 4), ((), 4), ((5, 4, 1), 5))
     ],
+    *each(
+        "schedule",
+        ValueError,
+        drop_at,
+        torch.ones(4),
+        torch.ones(0),
+        torch.ones(2, 2),
+        np.ones(4),
+        np.ones(0),
+        np.ones((2, 2)),
+    ),
     *[
         ("opacities", TypeError, lambda seed=seed, wrong=wrong: drop_layer(1.0, p=0.5, seed=seed)(wrong))
         for seed in (None, 3)
@@ -258,7 +285,7 @@ CASES = [
     ("seed", ValueError, lambda: kgs.DropGaussian().set_rng_state(torch.get_rng_state())),
     *bad_layer("schedule", "cosine", "", 3, None),
     *bad_layer("seed", 1.5, "a", True, 2**64, -(2**63) - 1, torch.tensor(1)),
-    *[("p * schedule(progress)", ValueError, lambda factor=factor: drop_at(factor)) for factor in (-1.0, 5.0, NAN)],
+    *each("p * schedule(progress)", ValueError, drop_at, -1.0, 5.0, NAN),
     # the model
     bad_points("points", ValueError, torch.rand(3, 3), torch.rand(3, 3)),
     bad_points("points, colors", ValueError, torch.rand(5, 2), torch.rand(5, 2)),
@@ -283,32 +310,24 @@ CASES = [
     bad_parameter("means", TypeError, torch.zeros(7, 3).half()),
     bad_parameter("means", TypeError, [[0.0, 0.0, 0.0]]),
     bad_parameter("quats", TypeError, None),
-    *[
-        ("sh_degree", ValueError, lambda degree=degree: setattr(random_model(), "sh_degree", degree))
-        for degree in (-1, 4, 1.0, "2")
-    ],
+    *each("sh_degree", ValueError, lambda degree: setattr(random_model(), "sh_degree", degree), -1, 4, 1.0, "2"),
     ("sh_degree", ValueError, lambda: kgs.GaussianModel.from_points(torch.rand(5, 3), torch.rand(5, 3), sh_degree=4)),
     # its file
-    *[
-        ("sh_degree", ValueError, lambda degree=degree: save_ply("no.ply", random_model(sh_degree=1), sh_degree=degree))
-        for degree in (0, 4, -1, 3.0)
-    ],
-    *[
-        ("offset", ValueError, lambda wrong=wrong: save_ply("no.ply", random_model(), wrong))
-        for wrong in (torch.zeros(1, 3), torch.tensor([0.0, NAN, 0.0]))
-    ],
-    *[
-        ("origin", ValueError, lambda wrong=wrong: load_ply("no.ply", wrong))
-        for wrong in (torch.zeros(1, 3), torch.tensor([0.0, NAN, 0.0]))
-    ],
+    *each("sh_degree", ValueError, saved_with_degree, 0, 4, -1, 3.0),
+    *each("offset", ValueError, lambda wrong: save_ply("no.ply", random_model(), wrong), *BAD_VECTORS),
+    ("model", TypeError, lambda: save_ply("no.ply", random_model()())),
+    ("model", TypeError, lambda: save_compressed_ply("no.ply", random_model()())),
+    ("model", ValueError, lambda: save_compressed_ply("no.ply", random_model(0))),
+    ("offset", ValueError, lambda: save_compressed_ply("no.ply", random_model(), torch.zeros(2))),
+    *each("origin", ValueError, lambda wrong: load_ply("no.ply", wrong), *BAD_VECTORS),
     # densification
     *bad_densifier("extent", 0.0, -1.0, NAN, INF),
     *bad_densifier("percent_dense", 0.0, NAN),
     *bad_densifier("grad_threshold", -1.0, NAN),
     *bad_densifier("prune_opacity", -0.1, 1.1, NAN),
     *bad_densifier("max_gaussians", 0, 2.5, NAN, INF),
-    *[("factor", ValueError, lambda x=x: make([SMALL])[2].decay_opacity(x)) for x in (0.0, 1.0, -0.5, NAN)],
-    *[("ceiling", ValueError, lambda x=x: make([SMALL])[2].reset_opacity(x)) for x in (0.0, 1.0, NAN)],
+    *each("factor", ValueError, lambda x: make([SMALL])[2].decay_opacity(x), 0.0, 1.0, -0.5, NAN),
+    *each("ceiling", ValueError, lambda x: make([SMALL])[2].reset_opacity(x), 0.0, 1.0, NAN),
     ("projected", ValueError, lambda: observe([SMALL] * 2)),
     ("projected", ValueError, lambda: observe([SMALL], absgrad=True)),
     ("projected", ValueError, lambda: observe([SMALL], grad=None)),
@@ -316,7 +335,7 @@ CASES = [
     ("gradient_sums", ValueError, state_of_another_size),
     ("state", ValueError, lambda: make([SMALL])[2].load_state_dict({})),
     ("optimizer", ValueError, optimizer_of_the_means_alone),
-    *[("optimizer", ValueError, lambda name=name: densifier_with(name)) for name in ("LBFGS", "Adafactor", "Rprop")],
+    *each("optimizer", ValueError, densifier_with, "LBFGS", "Adafactor", "Rprop"),
 ]
 
 

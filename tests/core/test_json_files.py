@@ -34,21 +34,26 @@ def test_anything_else_is_a_value_error(text: bytes) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "reason"),
+    "text",
     [
-        (b"[1, 2]", "expected a JSON object, got a list"),
-        (b'{"a": NaN}', "NaN is not a finite number"),
-        (b'{"a": 1e400}', "1e400 is not a finite number"),
-        (b'{"a": ' + b"[" * 100_000, "nested too deep"),
-        (b'{"a": 1', "not readable JSON"),
-        (b"\xff\xfe", "not readable JSON"),
-        (b'{"a": ' + b"9" * 5000 + b"}", "not readable JSON"),  # Python's own limit of the digits
+        b"[1, 2]",
+        b'{"a": NaN}',
+        b'{"a": 1e400}',
+        b'{"a": ' + b"[" * 100_000,
+        b'{"a": 1',
+        b"\xff\xfe",
+        b'{"a": ' + b"9" * 5000 + b"}",  # Python's own limit of the digits
+        b'{"a": 1}' + b" " * 2**26,  # over 64 MiB
     ],
+    ids=["a list", "NaN", "beyond float64", "nested too deep", "cut short", "not UTF-8", "digits", "too large"],
 )
-def test_files_that_are_refused(tmp_path: Path, text: bytes, reason: str) -> None:
-    (tmp_path / "a.json").write_bytes(text)
-    with pytest.raises(DataError, match=reason):
-        read_json(tmp_path / "a.json")
+def test_files_that_are_refused(tmp_path: Path, text: bytes) -> None:
+    path = tmp_path / "a.json"
+    path.write_bytes(text)
+    for refused in (path, tmp_path, tmp_path / "missing"):
+        with pytest.raises(DataError) as error:
+            read_json(refused)
+        assert error.value.path == refused
 
 
 def test_numbers_that_are_not_finite_are_read_on_request(tmp_path: Path) -> None:
@@ -63,12 +68,3 @@ def test_numbers_that_are_not_finite_are_read_on_request(tmp_path: Path) -> None
 def test_a_byte_order_mark_and_repeated_keys_are_read(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_bytes(b'\xef\xbb\xbf{"a": 1, "a": 2}')
     assert read_json(tmp_path / "a.json") == {"a": 2}
-
-
-def test_a_huge_file_is_not_read(tmp_path: Path) -> None:
-    with open(tmp_path / "a.json", "wb") as file:
-        file.truncate(2**27)  # takes no room on the disk
-    with pytest.raises(DataError, match="larger than 64 MiB"):
-        read_json(tmp_path / "a.json")
-    with pytest.raises(DataError, match="cannot be read"):
-        read_json(tmp_path)

@@ -4,16 +4,13 @@ import math
 
 import pytest
 import torch
-from factories import other_defaults, pinhole, random_model
+from factories import other_defaults, pinhole
 from factories import random_cloud as cloud
+from factories import random_model as model
 from torch import nn
 
 from kgs import GaussianRenderer
 from kgs.model import GaussianModel
-
-
-def model(n=7, degree=3, dtype=torch.float32):
-    return random_model(n, degree, dtype)
 
 
 def test_activations_are_exp_and_sigmoid():
@@ -47,12 +44,12 @@ def test_only_the_active_bands_are_in_colors(degree):
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_every_degree_has_six_parameters_and_starts_active(degree):
-    made = model(degree=degree)
+    made = model(sh_degree=degree)
     assert made.sh_degree == made.max_sh_degree == degree
-    assert [name for name, _ in made.named_parameters()] == [
-        *("means", "quats", "log_scales", "opacity_logits", "sh_dc", "sh_rest")
-    ]
+    names = ["means", "quats", "log_scales", "opacity_logits", "sh_dc", "sh_rest"]
+    assert [name for name, _ in made.named_parameters()] == names
     assert len(made) == 7
+    assert model(0, degree), "true, also without Gaussians"
 
 
 def test_first_values_follow_the_recipe():
@@ -67,7 +64,7 @@ def test_first_values_follow_the_recipe():
 
 
 def test_a_state_dict_rebuilds_a_model_of_any_size():
-    made = model(n=9, degree=2)
+    made = model(9, 2)
     made.sh_degree = 1
     for again, degree in (
         (GaussianModel(**made.state_dict()), 1),
@@ -83,7 +80,7 @@ def test_a_state_dict_rebuilds_a_model_of_any_size():
 @pytest.mark.parametrize("assign", [False, True])
 @pytest.mark.parametrize("n", [0, 5, 9])
 def test_load_state_dict_takes_over_size_and_degrees(n, assign):
-    made, other = model(n=9, degree=3), model(n=5, degree=1)
+    made, other = model(9, 3), model(5, 1)
     GaussianModel.load_state_dict(other, {**model(max(n, 4), 0).state_dict()})
     made.sh_degree = 2
     held = dict(other.named_parameters())
@@ -99,15 +96,15 @@ def test_load_state_dict_takes_over_size_and_degrees(n, assign):
 
 
 def test_the_six_parameters_alone_are_a_state_of_the_full_degree():
-    state = model(n=9, degree=2).state_dict()
+    state = model(9, 2).state_dict()
     del state["_extra_state"]
-    other = model(n=5, degree=0)
+    other = model(5, 0)
     other.load_state_dict(state)
     assert (len(other), other.sh_degree) == (9, 2)
 
 
 def test_a_state_that_does_not_fit_together_is_refused_and_changes_nothing():
-    made, other = model(n=9), model(n=5)
+    made, other = model(9), model(5)
     before = {name: value.clone() for name, value in other.state_dict().items()}
     changes = {"quats": torch.zeros(8, 4), "sh_rest": torch.zeros(9, 5, 3), "_extra_state": torch.tensor(4)}
     for name, change in changes.items():
@@ -117,11 +114,6 @@ def test_a_state_that_does_not_fit_together_is_refused_and_changes_nothing():
         assert all(torch.equal(value, before[name]) for name, value in other.state_dict().items())
     with pytest.raises(RuntimeError, match="Missing key"):
         other.load_state_dict({"means": other.means})
-
-
-def test_a_model_without_gaussians_is_true():
-    assert model(0)
-    assert len(model(0)) == 0
 
 
 @pytest.mark.parametrize(
@@ -153,12 +145,6 @@ def test_default_device_and_default_dtype_do_not_reach_a_model():
     assert all(torch.equal(value, expected[name]) for name, value in made.state_dict().items())
 
 
-def test_repr_says_how_many_and_which_degree():
-    made = model()
-    made.sh_degree = 1
-    assert repr(made) == "GaussianModel(7 Gaussians, sh_degree=1 of 3, torch.float32)"
-
-
 def test_antialiased_is_kept_by_what_makes_another_model():
     assert not GaussianModel.from_points(*cloud()).antialiased
     state = model().state_dict()
@@ -166,4 +152,5 @@ def test_antialiased_is_kept_by_what_makes_another_model():
     assert made.state_dict().keys() == state.keys()
     for again in (made.select(torch.arange(3)), made.to(torch.float64), copy.deepcopy(made)):
         assert again.antialiased
-    assert repr(made).endswith("torch.float64, antialiased)")
+    made.sh_degree = 1
+    assert repr(made) == "GaussianModel(7 Gaussians, sh_degree=1 of 3, torch.float64, antialiased)"

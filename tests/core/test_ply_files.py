@@ -13,9 +13,9 @@ from factories import random_model, splat_columns
 from kgs._support.errors import DataError
 from kgs.ply import load_ply, save_ply
 
-SIZES = {"char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I", "float": "f", "double": "d"}
-ALIASES = {"int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I"}
-FORMATS = SIZES | ALIASES | {"float32": "f", "float64": "d"}
+FORMATS = {"char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I", "float": "f", "double": "d"}
+FORMATS |= {"int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I"}
+FORMATS |= {"float32": "f", "float64": "d"}
 
 
 def handmade(columns, rows, order="binary_little_endian", newline="\n", before=(), after=(), count=None):
@@ -223,33 +223,20 @@ def test_rows_that_are_no_gaussians_are_left_out_and_counted(tmp_path, rows, mes
     assert all(bool(parameter.isfinite().all()) for parameter in model.parameters())
 
 
-def test_a_file_without_rows_is_an_empty_model(tmp_path):
-    (tmp_path / "a.ply").write_bytes(handmade(FLOATS, []))
-    assert len(load_ply(tmp_path / "a.ply")) == 0
-
-
 @pytest.mark.parametrize("order", ["binary_little_endian", "ascii"])
 def test_memory_is_bounded_by_what_the_header_promises(tmp_path, order):
     path = tmp_path / "a.ply"
-    path.write_bytes(handmade(FLOATS, [ROW], order))
+    # an ascii file promises more numbers than it has: zero bytes stand in their stead
+    path.write_bytes(handmade(FLOATS, [ROW], order, count=20 if order == "ascii" else 1))
     with open(path, "r+b") as file:
         file.truncate(2**32)  # takes no room on the disk
     tracemalloc.start()
     try:
         with pytest.raises(DataError, match="vertex"):
-            load_ply(path) if order != "ascii" else load_ply(_with_vertices(path, 20))
+            load_ply(path)
         assert tracemalloc.get_traced_memory()[1] < 2**22
     finally:
         tracemalloc.stop()
-
-
-def _with_vertices(path, count):
-    """As many as are promised, and zero bytes where the numbers should be."""
-    with open(path, "r+b") as file:
-        data = file.read(1 << 16)
-        file.seek(0)
-        file.write(data.replace(b"element vertex 1\n", f"element vertex {count}\n".encode()))
-    return path
 
 
 def test_long_ascii_files_are_read_in_parts_that_cut_no_word(tmp_path):
@@ -262,7 +249,7 @@ def test_long_ascii_files_are_read_in_parts_that_cut_no_word(tmp_path):
         assert torch.equal(means, torch.tensor(rows, dtype=torch.float64)[:, :3].float())
 
 
-@pytest.mark.parametrize("order", ["binary_big_endian", "ascii"])
+@pytest.mark.parametrize("order", ["binary_little_endian", "binary_big_endian", "ascii"])
 def test_a_file_without_gaussians_is_an_empty_model(tmp_path, order):
     (tmp_path / "a.ply").write_bytes(handmade(FLOATS, [], order).rstrip(b"\n") + b"\n")
     assert len(load_ply(tmp_path / "a.ply")) == 0

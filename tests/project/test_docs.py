@@ -17,12 +17,6 @@ import torch
 from tiny_scenes import narrow_lpips
 
 import kgs
-from kgs.fit.config import DETAILS, DROP, PRESETS, FitConfig
-from kgs.fit.haze import FRONT, HAZE, WINDOW
-from kgs.fit.overlap import MAX_STEPS, STEPS_OF_A_PHOTO
-from kgs.fit.plan import MANY as USUAL
-from kgs.fit.plan import with_step_defaults
-from kgs.init_points.dense import MAX_POINTS, MAX_POINTS_FEW_VIEWS, MIN_POINTS, PIXELS_OF_A_POINT
 from kgs.metrics.lpips import Lpips
 
 ROOT = Path(__file__).parents[2]
@@ -89,70 +83,7 @@ def test_the_examples_of_docstrings_do_what_they_say(module, tmp_path, monkeypat
     assert not found.failed
 
 
-# -- numbers ---------------------------------------------------------------------------------------------------------
-
-AUTO, PAPER, LOW, HIGH = FitConfig(), PRESETS["paper"], DETAILS["low"], DETAILS["high"]
-FEW, MANY = with_step_defaults(AUTO, 3), with_step_defaults(AUTO, 4)  # the default for up to three views, and for more
-STEPS_OF_BOTH = [FEW.steps, MAX_STEPS]
-# A page, what it says with a # for each number, and these numbers.
-NUMBERS = [
-    ("README.md", "DropGaussian(p=#)", [PAPER.drop]),
-    ("README.md", "whose rate grows to #, it gains", [DROP]),
-    ("docs/layer.md", "The paper has p = #", [PAPER.drop]),
-    ("docs/layer.md", "is p = #, with nothing dropped in the last #", [DROP, AUTO.no_drop_steps]),
-    ("docs/comparison.md", "steps of a full run | # for up to three photos, up to # for more", STEPS_OF_BOTH),
-    (
-        "docs/comparison.md",
-        "initial points, of which there are # to #, or #",
-        [MIN_POINTS, MAX_POINTS, MAX_POINTS_FEW_VIEWS],
-    ),
-    ("docs/how-to-photograph.md", "A fit takes # steps for up to three photos and [up to # for more", STEPS_OF_BOTH),
-    ("docs/measured.md", "three seeds): # steps from # of the same", [PAPER.steps, PAPER.init_points]),
-    ("docs/command.md", "| low | # | # | #, the", [LOW.size, LOW.entries["init_points"], LOW.entries["steps"]]),
-    ("docs/command.md", "# to #, one for every # pixels", [MIN_POINTS, MAX_POINTS, PIXELS_OF_A_POINT]),
-    ("docs/command.md", "three photos to # | # for up to three photos, for", [MAX_POINTS_FEW_VIEWS, FEW.steps]),
-    ("docs/command.md", "for more [# to #]", STEPS_OF_BOTH),
-    ("docs/command.md", "| normal | # for unposed", [DETAILS["normal"].size]),
-    ("docs/how-to-photograph.md", "and fitted at # on a CPU", [DETAILS["normal"].size]),
-    ("docs/photos.md", "takes them at # pixels on a CPU", [DETAILS["normal"].size]),
-    ("docs/command.md", "| high | #, also of photos with poses", [HIGH.size]),
-    ("docs/command.md", "`normal` leaves at their own size | # |", [HIGH.entries["init_points"]]),
-    ("docs/recipe.md", "times # (up to three", [FEW.recipe.opacity_decay]),
-    ("docs/recipe.md", "or # after every step, from # % of", [MANY.recipe.opacity_decay, 100 * AUTO.recipe.decay_from]),
-    ("docs/recipe.md", "| steps | #, here # | # for up", [PAPER.recipe.steps, PAPER.steps, FEW.steps]),
-    ("docs/recipe.md", "for up to three photos; for more, up to #", [MAX_STEPS]),
-    ("docs/recipe.md", "**Steps**: #, and # more for each", [FEW.steps, STEPS_OF_A_PHOTO]),
-    ("docs/recipe.md", "have no patches: then there are # steps", [USUAL.steps]),
-    ("docs/recipe.md", "by # in a window of #x7", [HAZE, WINDOW]),
-    ("docs/recipe.md", "lie nearer than # times the median", [FRONT]),
-    ("docs/recipe.md", "| initial points | # of", [PAPER.init_points]),
-    (
-        "docs/recipe.md",
-        "every # pixels on whose depth two views agree, # to #",
-        [PIXELS_OF_A_POINT, MIN_POINTS, MAX_POINTS],
-    ),
-    ("docs/recipe.md", "(up to three photos to #), each", [MAX_POINTS_FEW_VIEWS]),
-    ("docs/recipe.md", "| scales #, quaternions # | scales", [PAPER.recipe.lr_scales, PAPER.recipe.lr_quats]),
-    ("docs/recipe.md", "| scales #, quaternions # | in", [AUTO.recipe.lr_scales, AUTO.recipe.lr_quats]),
-    ("docs/recipe.md", "L1 + # (1 - SSIM) | L1 + # (1", [PAPER.recipe.dssim_weight, AUTO.recipe.dssim_weight]),
-    ("docs/recipe.md", "centre exceeds # |", [PAPER.recipe.grad_threshold]),
-    ("docs/recipe.md", "(AbsGS) exceeds # |", [AUTO.recipe.grad_threshold]),
-    ("docs/recipe.md", "opacities below # | opacities", [PAPER.recipe.prune_opacity]),
-    ("docs/recipe.md", "| opacities below # | they fade", [AUTO.recipe.prune_opacity]),
-    ("docs/recipe.md", "| # t/T to the end | # t/T, none", [PAPER.drop, DROP]),
-    ("docs/recipe.md", "none in the last # steps", [AUTO.no_drop_steps]),
-    ("notebooks/03_three_views.ipynb", "`kgs fit` takes # steps on larger photos", [FEW.steps]),
-    ("notebooks/03_three_views.ipynb", "with a drop rate that grows to #", [DROP]),
-    ("docs/departures.md", "| # x the 1st percentile", [PAPER.recipe.near_plane]),
-]
-
-
-@pytest.mark.parametrize(("page", "text", "numbers"), NUMBERS)
-def test_numbers_of_the_settings_are_those_of_the_code(page, text, numbers):
-    pattern = re.escape(text).replace(r"\#", r"(\d+(?: \d{3})*(?:\.\d+)?)").replace(r"\ ", r"\s+")
-    found = re.search(pattern, (ROOT / page).read_text(encoding="utf-8"))
-    assert found, "the page does not say so"
-    assert [float(number.replace(" ", "")) for number in found.groups()] == pytest.approx(numbers)
+# -- pages ----------------------------------------------------------------------------------------------------------
 
 
 def test_each_page_of_the_guide_leads_to_the_next():
@@ -255,18 +186,18 @@ def test_links_are_found():
 
 @pytest.mark.skipif(shutil.which("sed") is None, reason="no sed")
 def test_the_readme_of_a_published_package_links_to_the_repository(tmp_path):
-    """As CONTRIBUTING.md has it, in its own words."""
-    shutil.copy(ROOT / "README.md", tmp_path)
+    """By the commands in CONTRIBUTING.md."""
     (block,) = re.findall(r"^(REPOSITORY=.*?README\.md\n)", (ROOT / "CONTRIBUTING.md").read_text(), re.M | re.S)
-    before = (ROOT / "README.md").read_text(encoding="utf-8")
+    shutil.copy(ROOT / "README.md", tmp_path)
     subprocess.run(["sh", "-ec", block], cwd=tmp_path, check=True)
-    after = (tmp_path / "README.md").read_text(encoding="utf-8")
+    before, after = ((folder / "README.md").read_text(encoding="utf-8") for folder in (ROOT, tmp_path))
+    address = r"https://github.com/OWNER/kgs/(raw|blob)/v[\d.]+/"
     assert not links(after)
-    made = re.findall(r"https://github.com/OWNER/kgs/(raw|blob)/v[\d.]+/([^)#]+)", after)
-    assert sorted(path for _, path in made) == sorted(link.partition("#")[0] for link in links(before))
-    shown = {path for kind, path in made if kind == "raw"}  # what a browser has to show as it is
-    assert shown == {path for _, path in made if path.endswith((".jpg", ".png", ".html"))} > {"docs/demo.html"}
-    assert re.sub(r"https://github.com/OWNER/kgs/(raw|blob)/v[\d.]+/", "", after) == before
+    assert re.sub(address, "", after) == before
+    made = {path: kind for kind, path in re.findall(address + r"([^)#]+)", after)}
+    assert made.keys() == {link.partition("#")[0] for link in links(before)}
+    for path, kind in made.items():  # raw: what a browser has to show as it is
+        assert kind == ("raw" if path.endswith((".jpg", ".png", ".html")) else "blob"), path
 
 
 @pytest.mark.slow

@@ -45,11 +45,17 @@ SOURCES = {module_name(path): path for folder in PACKAGES for path in sorted((RO
 
 
 @functools.cache
+def nodes(name):
+    """All of the code of a module."""
+    return [*ast.walk(ast.parse(SOURCES[name].read_text(encoding="utf-8")))]
+
+
+@functools.cache
 def imports(name):
     """Absolute names of all that a module imports, at any depth of its code, for types only included."""
     path, found = SOURCES[name], set()
     package = name.split(".") if path.stem == "__init__" else name.split(".")[:-1]
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in nodes(name):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -59,6 +65,7 @@ def imports(name):
     return found
 
 
+@functools.cache
 def imported_modules(name):
     """Modules of ours among them: of `from a import b`, a.b where that is a module, else a."""
     return {known for known in (f if f in SOURCES else f.rpartition(".")[0] for f in imports(name)) if known in SOURCES}
@@ -164,7 +171,7 @@ def test_every_module_says_what_it_is_and_exports_what_it_has(name):
         pytest.importorskip("numba")
     module = importlib.import_module(name)
     assert module.__doc__
-    if len(ast.parse(SOURCES[name].read_text(encoding="utf-8")).body) == 1:
+    if len(nodes(name)[0].body) == 1:
         return  # a folder with nothing of its own
     names = getattr(module, "__all__", ())  # modules of no public name need none
     assert len(set(names)) == len(names)
@@ -235,17 +242,22 @@ PARTS_GONE = {"place": "device, folder, pixels, rows, centers", "most": "max", "
 AUTOGRAD = {"needs"}  # of torch: needs_input_grad
 
 
+def words(node):
+    """The names that a part of the code uses, and strings that are one."""
+    match node:
+        case ast.Name(id=word) | ast.Attribute(attr=word) | ast.FunctionDef(name=word) | ast.ClassDef(name=word):
+            yield word
+        case ast.arg(arg=str(word)) | ast.keyword(arg=str(word)):
+            yield word
+        case ast.Constant(value=str(word)) if re.fullmatch(r"\w+", word):
+            yield word
+
+
 def test_words_that_are_gone_stay_gone():
     """Names in code, and option names and keys in strings; prose is not searched."""
     found = []
-    for module, path in SOURCES.items():
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        names = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
-        names |= {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
-        names |= {node.arg for node in ast.walk(tree) if isinstance(node, ast.arg | ast.keyword) and node.arg}
-        names |= {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef)}
-        names |= {n.value for n in ast.walk(tree) if isinstance(n, ast.Constant) and re.fullmatch(r"\w+", str(n.value))}
-        for name in map(str, names):
+    for module in SOURCES:
+        for name in {word for node in nodes(module) for word in words(node)}:
             word = name.strip("_").lower()
             allowed = within(module, "kgs.backends", "kgs.stages") and word in AUTOGRAD
             parts = set(word.removesuffix("s").split("_")) & PARTS_GONE.keys()

@@ -104,31 +104,29 @@ CLAIMS = {
             assert gaps[0] > gaps[1] + 0.2  # single fits overlap: a rounding moves a gap by 0.3 dB
         """,
     ),
+    "07_your_own_photos": (
+        """
+        assert max(errors) < 1 and abs(report["focal_px"] / float(truth.cameras.intrinsics[0, 0, 0]) - 1) < 0.03
+        assert len(scene.test) == 0 and len(scene.train) == COUNT
+        assert fit.history["steps"] == judge.history["steps"] == STEPS and half.test.names == ("1.png",)
+        """,
+        """
+        assert max(errors) < 0.2 and fit.psnr(scene.train) > 28
+        assert 15 < judge.psnr(half.test) < judge.psnr(half.train)
+        """,
+    ),
+    "08_from_gsplat": (
+        """
+        assert info["means2d"].shape == (1, len(params["means"]), 2)
+        assert viewmats.grad.any() and Ks.grad[0, :2, :3].any() and renders.shape[-1] == 4
+        """,
+        """
+        levels = {name: level for name, (_, level, _) in results.items()}
+        assert min(levels.values()) > 18 and levels["DropGaussian"] > levels["without the layer"] - 0.5
+        assert all(len(params["means"]) > len(points.points) for params, _, _ in results.values())  # it densified
+        """,
+    ),
 }
-
-CLAIMS["07_your_own_photos"] = (
-    """
-    assert max(errors) < 1 and abs(report["focal_px"] / float(truth.cameras.intrinsics[0, 0, 0]) - 1) < 0.03
-    assert len(scene.test) == 0 and len(scene.train) == COUNT
-    assert fit.history["steps"] == judge.history["steps"] == STEPS and half.test.names == ("1.png",)
-    """,
-    """
-    assert max(errors) < 0.2 and fit.psnr(scene.train) > 28
-    assert 15 < judge.psnr(half.test) < judge.psnr(half.train)
-    """,
-)
-
-CLAIMS["08_from_gsplat"] = (
-    """
-    assert info["means2d"].shape == (1, len(params["means"]), 2)
-    assert viewmats.grad.any() and Ks.grad[0, :2, :3].any() and renders.shape[-1] == 4
-    """,
-    """
-    levels = {name: level for name, (_, level, _) in results.items()}
-    assert min(levels.values()) > 18 and levels["DropGaussian"] > levels["without the layer"] - 0.5
-    assert all(len(params["means"]) > len(points.points) for params, _, _ in results.values())  # it densified
-    """,
-)
 
 
 @pytest.fixture
@@ -207,27 +205,20 @@ def test_it_runs_in_full(path, workdir):
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_one_cell_near_the_top_sets_the_sizes_and_it_is_stored_as_run_from_top_to_bottom(path):
+def test_it_is_stored_small_as_run_from_top_to_bottom_and_one_cell_near_the_top_sets_the_sizes(path):
+    assert path.stat().st_size < 400_000
     notebook = nbformat.read(path, as_version=4)
-    assert [i for i, cell in enumerate(notebook.cells) if "KGS_QUICK" in cell.source] == [1]
-    assert [i for i, cell in enumerate(notebook.cells) if "environ" in cell.source] == [1]
+    for word in ("KGS_QUICK", "environ"):
+        assert [i for i, cell in enumerate(notebook.cells) if word in cell.source] == [1]
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
     assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1))
     outputs = [output for cell in code for output in cell.outputs]
     assert not [output for output in outputs if output.output_type == "error" or output.get("name") == "stderr"]
     assert pictures(notebook) >= 3
-
-
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_it_is_small_and_names_no_path_on_a_disk(path):
-    assert path.stat().st_size < 400_000
-    notebook = nbformat.read(path, as_version=4)
-    texts = [cell.source for cell in notebook.cells]
-    for cell in notebook.cells:
-        for output in cell.get("outputs", []):
-            texts += [output.get("text", ""), *(v for k, v in output.get("data", {}).items() if k.startswith("text/"))]
-    absolute = re.compile(r"(?<![\w.:/<])(?:/|~/)[A-Za-z_][\w.-]*/|\b[A-Z]:\\")
-    assert not [found for text in texts for found in absolute.findall(text)]
+    texts = [cell.source for cell in notebook.cells] + [output.get("text", "") for output in outputs]
+    texts += [v for output in outputs for k, v in output.get("data", {}).items() if k.startswith("text/")]
+    path_on_a_disk = re.compile(r"(?<![\w.:/<])(?:/|~/)[A-Za-z_][\w.-]*/|\b[A-Z]:\\")
+    assert not [found for text in texts for found in path_on_a_disk.findall(text)]
 
 
 # -- your own photos -------------------------------------------------------------------------------------------------
@@ -244,68 +235,62 @@ def test_it_is_stored_without_photos_of_others():
     assert all("MIT licence" in text and "dataset_banana" in text for text in (cell.source, about))
 
 
-def hosted_cell(monkeypatch, folder, fit):
-    """Run the cell for hosted notebooks in this folder; returns what it asked of IPython, and what it displayed."""
+@pytest.fixture
+def hosted_cell(monkeypatch, tmp_path):
+    """Runs the cell for hosted notebooks; returns what it asked of IPython, and the pages that it displayed."""
     display = pytest.importorskip("IPython.display")
     from IPython.core.inputtransformer2 import TransformerManager
 
-    asked, shown, names = [], [], {}
+    def run(folder=tmp_path, page=None):
+        asked, shown, names = [], [], {}
 
-    class Shell:
-        def run_line_magic(self, *words):
-            asked.append(" ".join(words).format(**names))
+        class Shell:
+            def run_line_magic(self, *words):
+                asked.append(" ".join(words).format(**names))
 
-        def system(self, line):
-            asked.append(line.format(**names))
-            fit()
+            def system(self, line):
+                asked.append(line.format(**names))
+                if page is not None:
+                    Path("out").mkdir()
+                    Path("out", "index.html").write_text(page)
 
-    monkeypatch.chdir(folder)
-    monkeypatch.setattr(display, "display", lambda html: shown.append(html.data))
-    source = TransformerManager().transform_cell(YOUR_OWN.cells[-1].source)
-    names["get_ipython"] = Shell
-    exec(compile(source, "the cell for hosted notebooks", "exec"), names)
-    return asked, shown
+        monkeypatch.chdir(folder)
+        monkeypatch.setattr(display, "display", lambda html: shown.append(html.data))
+        source = TransformerManager().transform_cell(YOUR_OWN.cells[-1].source)
+        names["get_ipython"] = Shell
+        exec(compile(source, "the cell for hosted notebooks", "exec"), names)
+        return asked, shown
 
-
-def write_page():
-    Path("out").mkdir()
-    Path("out", "index.html").write_text('<p title="a">')
-
-
-FRAMED = 'srcdoc="&lt;p title=&quot;a&quot;&gt;"'
+    monkeypatch.delitem(sys.modules, "google.colab", raising=False)
+    return run
 
 
-def test_on_colab_photos_are_uploaded_and_the_page_is_shown(tmp_path, monkeypatch):
+def test_on_colab_photos_are_uploaded_and_the_page_is_shown(hosted_cell, tmp_path, monkeypatch):
     files = SimpleNamespace(upload=lambda: {"IMG_1.jpg": b"1", "../IMG 2.jpg": b"2"})
     google = SimpleNamespace(files=files)
     monkeypatch.setitem(sys.modules, "google", SimpleNamespace(colab=google))
     monkeypatch.setitem(sys.modules, "google.colab", google)
-    asked, shown = hosted_cell(monkeypatch, tmp_path, write_page)
+    asked, (shown,) = hosted_cell(page='<p title="a">')
     assert asked == ['pip install -q "kgs-splat[app,sfm,heic]"', 'kgs fit "photos" -o out']
-    assert {path.name: path.read_bytes() for path in (tmp_path / "photos").iterdir()} == {
-        "IMG_1.jpg": b"1",
-        "IMG 2.jpg": b"2",
-    }
-    assert len(shown) == 1
-    assert FRAMED in shown[0]
+    uploaded = {path.name: path.read_bytes() for path in (tmp_path / "photos").iterdir()}
+    assert uploaded == {"IMG_1.jpg": b"1", "IMG 2.jpg": b"2"}
+    assert 'srcdoc="&lt;p title=&quot;a&quot;&gt;"' in shown
 
 
-def test_on_kaggle_photos_are_those_of_the_input(tmp_path, monkeypatch):
+def test_on_kaggle_photos_are_those_of_the_input(hosted_cell, tmp_path, monkeypatch):
     spec = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: name == "kaggle_secrets" or spec(name))
-    monkeypatch.delitem(sys.modules, "google.colab", raising=False)
     (tmp_path / "input" / "my photos").mkdir(parents=True)
     (tmp_path / "working").mkdir()
     (tmp_path / "input" / "my photos" / "1.JPG").touch()
     (tmp_path / "working" / "kgs_splat-0.1.0-py3-none-any.whl").touch()
-    asked, shown = hosted_cell(monkeypatch, tmp_path / "working", lambda: None)
+    asked, shown = hosted_cell(tmp_path / "working")
     wheel = "./kgs_splat-0.1.0-py3-none-any.whl"
     assert asked == [f'pip install -q "{wheel}[app,sfm,heic]"', 'kgs fit "../input/my photos" -o out']
     assert not shown, "without a page kgs has said why"
 
 
-def test_on_any_other_machine_nothing_happens(tmp_path, monkeypatch, capsys):
-    monkeypatch.delitem(sys.modules, "google.colab", raising=False)
-    assert hosted_cell(monkeypatch, tmp_path, write_page) == ([], [])
+def test_on_any_other_machine_nothing_happens(hosted_cell, tmp_path, capsys):
+    assert hosted_cell(page="<p>") == ([], [])
     assert "no hosted notebook" in capsys.readouterr().out
     assert not list(tmp_path.iterdir())

@@ -1,6 +1,7 @@
 """The study's views beyond the photos: where cameras lie, which pixels count, and what a cell and the report hold."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -30,12 +31,14 @@ def targets(arc):
 
 
 @pytest.mark.slow
-def test_cameras_before_the_room_lie_so_many_times_as_far_out():
-    for out in (1.0, 2.5):
-        centers = camera_centers(views_beyond("room", out, 4, (6, 8)).cameras.extrinsics).numpy()
-        flat = (centers - room.EYE)[:, :2] / room.PATCH[:2]
-        np.testing.assert_allclose(np.linalg.norm(flat, axis=1), out, rtol=1e-4)
-        np.testing.assert_allclose(centers[:, 2], room.EYE[2], atol=1e-5)
+@pytest.mark.parametrize("kind", ["room", "orbit"])
+def test_cameras_lie_so_many_times_as_far_from_their_middle(kind):
+    centers = [camera_centers(views_beyond(kind, out, 4, (6, 8)).cameras.extrinsics) for out in (1.0, 2.5)]
+    middle = torch.from_numpy(room.EYE).to(centers[0]) if kind == "room" else centers[0].mean(dim=0)
+    near, far = (each - middle for each in centers)
+    torch.testing.assert_close(far, 2.5 * near, atol=1e-4, rtol=1e-4)
+    if kind == "room":  # as far as the training cameras, or the outermost of them
+        torch.testing.assert_close((near[:, :2] / torch.tensor(room.PATCH[:2])).norm(dim=1), torch.ones(4).to(near))
 
 
 @pytest.mark.slow
@@ -47,13 +50,6 @@ def test_cameras_of_the_arc_stay_at_their_distance_and_look_at_its_middle():
     np.testing.assert_allclose(np.hypot(angles / ARC_SPAN, away[:, 1] / ARC_HEIGHT), 3.0, rtol=1e-4)
     axes = cameras.extrinsics[:, 2, :3].double().numpy()
     np.testing.assert_allclose(axes, -away / np.linalg.norm(away, axis=1, keepdims=True), atol=1e-5)
-
-
-@pytest.mark.slow
-def test_the_orbit_s_cameras_lie_on_a_larger_circle():
-    near, far = (camera_centers(views_beyond("orbit", out, 3, (6, 8)).cameras.extrinsics) for out in (1.0, 2.0))
-    middle = near.mean(dim=0)
-    torch.testing.assert_close(far - middle, 2 * (near - middle), atol=1e-4, rtol=1e-4)
 
 
 @pytest.mark.slow
@@ -107,32 +103,30 @@ def test_only_pixels_that_count_are_compared():
     assert nothing == {"share": 0.0, "psnr": None, "lpips": None}
 
 
-def test_real_scenes_are_trained_from_the_middle_and_tested_outside(tmp_path):
-    centers = torch.tensor([5.0, 0.0, -1.0, 1.0, -6.0, 2.0, -2.0, 0.9])
-    extrinsics = torch.eye(4).repeat(8, 1, 1)
-    extrinsics[:, 0, 3] = -centers
-    views = as_views(pinholes(torch.eye(4).repeat(8, 1, 1), extrinsics, (2, 3)), torch.rand(8, 3, 2, 3))
+def scene_along(x, photos, **changes):
+    """A scene of photos without points, by cameras at these x."""
+    extrinsics = torch.eye(4).repeat(len(photos), 1, 1)
+    extrinsics[:, 0, 3] = -torch.tensor(x)
+    intrinsics = torch.eye(4).repeat(len(photos), 1, 1)
+    views = as_views(pinholes(intrinsics, extrinsics, tuple(photos.shape[-2:])), photos)
     none = torch.zeros(0, 3)
-    whole = Scene(
-        views, views.select([]), none, none, "none", torch.zeros(3), torch.zeros(3), tmp_path, train_full_size=views
+    return Scene(
+        views, views.select([]), none, none, "none", torch.zeros(3), torch.zeros(3), Path(), train_full_size=views
     )
+
+
+def test_real_scenes_are_trained_from_the_middle_and_tested_outside():
+    whole = scene_along([5.0, 0.0, -1.0, 1.0, -6.0, 2.0, -2.0, 0.9], torch.rand(8, 3, 2, 3))
     scene = from_the_middle(whole, 3)
-    assert scene.train.names == ("1.png", "2.png", "7.png")
-    assert scene.train_full_size is not None
-    assert scene.train_full_size.names == scene.train.names
+    assert scene.train.names == scene.train_full_size.names == ("1.png", "2.png", "7.png")
     assert scene.test.names == ("0.png", "4.png")
     assert len(from_the_middle(whole, 7).test) == 1
 
 
-def test_a_border_is_that_of_the_photos_in_the_middle(tmp_path):
-    extrinsics = torch.eye(4).repeat(8, 1, 1)
-    extrinsics[:, 0, 3] = torch.arange(8.0)
+def test_a_border_is_that_of_the_photos_in_the_middle():
     photos = torch.full((8, 3, 200, 40), 0.6)
     photos[2:5, :, 0] = 0.3
-    views = as_views(pinholes(torch.eye(4).repeat(8, 1, 1), extrinsics, (200, 40)), photos)
-    none = torch.zeros(0, 3)
-    whole = Scene(views, views.select([]), none, none, "none", torch.zeros(3), torch.zeros(3), tmp_path)
-    scene = from_the_middle(whole, 3)
+    scene = from_the_middle(scene_along(torch.arange(8.0).tolist(), photos), 3)
     for part in (scene.train, scene.test):
         assert part.border_mask is not None
         torch.testing.assert_close(part.border_mask[0], torch.full((40,), 0.5))

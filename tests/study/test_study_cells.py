@@ -62,29 +62,34 @@ def test_a_package_that_is_missing_is_named_before_any_work(package, tmp_path, m
 def test_each_cell_is_there_once_and_is_a_fit(preset, guarded):
     cells = sparse_cells(preset, guarded)
     assert len({json.dumps(cell, sort_keys=True) for cell in cells}) == len(cells)
-    for cell in cells:
-        fit, _ = cells_module._split({key: value for key, value in cell["fit"].items() if key != "preset"})
+    for method, settings in {cell["method"]: cell["fit"] for cell in cells}.items():
+        assert all(cell["fit"] == settings for cell in cells if cell["method"] == method)
+        fit, _ = cells_module._split({key: value for key, value in settings.items() if key != "preset"})
         config = FitConfig.from_dict(FitConfig().to_dict() | fit)
-        assert config.drop == METHODS[cell["method"]].get("drop", FitConfig().drop)
+        assert config.drop == METHODS[method].get("drop", FitConfig().drop)
+
+
+def settings(cells):
+    return Counter((cell["scene"], cell["views"], cell["start"], cell["method"]) for cell in cells)
+
+
+def all_seeds(scenes, methods, start="dense"):
+    return {(*scene, start, method): 3 for scene, method in product(scenes, methods)}
 
 
 def test_the_preset_field_begins_with_what_no_later_recipe_changes(data):
     cells = sparse_cells("field", data)
+    forward, objects = [*SCENES.items()][:3], [*SCENES.items()][3:]
+    assert settings(cells[:27]) == all_seeds(forward, MAIN)
+    assert settings(cells[27:54]) == all_seeds(objects, MAIN)
+    assert settings(cells[54:90]) == all_seeds(SCENES.items(), (AUTO, AUTO_OFF))
     for cell in cells:
-        own = cell["method"] in (AUTO, AUTO_OFF)
-        assert cell["fit"]["steps"] == (None if own else 2000)
+        assert cell["fit"]["steps"] == (None if cell["method"] in (AUTO, AUTO_OFF) else 2000)
         assert cell["downscale"] is None
-    forward, objects = cells[:27], cells[27:54]
-    assert {cell["method"] for cell in cells[:54]} == {*MAIN}
-    assert {(cell["scene"], cell["views"]) for cell in forward} == {*[*SCENES.items()][:3]}
-    assert {(cell["scene"], cell["views"]) for cell in objects} == {*[*SCENES.items()][3:]}
-    assert {cell["seed"] for cell in forward} == {cell["seed"] for cell in objects} == {0, 1, 2}
-    assert {cell["method"] for cell in cells[54:90]} == {AUTO, AUTO_OFF}
     (data / "colmap/fountain").mkdir()
-    more = sparse_cells("field", data)
-    joined = [cell for cell in more if cell not in cells]
-    assert {(cell["scene"], cell["views"]) for cell in joined} == {("colmap/fountain", 3), ("colmap/fountain", 6)}
-    assert {cell["method"] for cell in joined} == {"off", "progressive 0.2", AUTO, AUTO_OFF}
+    joined = [cell for cell in sparse_cells("field", data) if cell not in cells]
+    fountain = [("colmap/fountain", 3), ("colmap/fountain", 6)]
+    assert settings(joined) == all_seeds(fountain, ("off", "progressive 0.2", AUTO, AUTO_OFF))
     long = sparse_cells("field-long", data)
     assert len(long) == 27
     assert {cell["fit"]["steps"] for cell in long} == {10_000}
@@ -92,28 +97,16 @@ def test_the_preset_field_begins_with_what_no_later_recipe_changes(data):
 
 def test_the_preset_cpu_holds_what_the_study_must_show(data):
     cells = sparse_cells("cpu", data)
-    count = Counter((cell["scene"], cell["views"], cell["start"], cell["method"]) for cell in cells)
-    for scene, views in SCENES.items():
-        for method in ("off", "progressive 0.2", "fixed 0.1"):
-            assert count[scene, views, "dense", method] == 3
-        assert count[scene, views, "sift", "progressive 0.2"] == 3
-        assert count[scene, views, "dense", "auto"] == count[scene, views, "dense", "auto, off"] == 3
-    for scene, views in (
-        *product(("llff/fern", "llff/flower"), (6, 9)),
-        ("nerfstudio/fox", 6),
-        ("colmap/monstree", 12),
-    ):
-        for method in ("off", "progressive 0.2", "auto", "auto, off"):
-            assert count[scene, views, "dense", method] == 3
-    assert all(count["llff/fern", 3, "dense", method] == 3 for method in METHODS)
     assert {cell["fit"]["steps"] for cell in cells} == {2000}
-
-
-def test_methods_of_one_start_follow_each_other(data):
-    cells = sparse_cells("cpu", data)[:6]
-    assert [cell["method"] for cell in cells] == ["off", "progressive 0.2", "fixed 0.1"] * 2
-    assert [cell["scene"] for cell in cells] == ["llff/fern"] * 3 + ["llff/flower"] * 3
-    assert {cell["seed"] for cell in cells} == {0}
+    first = cells[:6]  # methods of one start follow each other
+    assert [cell["method"] for cell in first] == ["off", "progressive 0.2", "fixed 0.1"] * 2
+    assert [(cell["scene"], cell["seed"]) for cell in first] == [("llff/fern", 0)] * 3 + [("llff/flower", 0)] * 3
+    more_views = [*product(("llff/fern", "llff/flower"), (6, 9)), ("nerfstudio/fox", 6), ("colmap/monstree", 12)]
+    expected = all_seeds(SCENES.items(), ("off", "progressive 0.2", "fixed 0.1", AUTO, AUTO_OFF))
+    expected |= all_seeds(more_views, ("off", "progressive 0.2", AUTO, AUTO_OFF))
+    expected |= all_seeds([("llff/fern", 3)], METHODS)
+    expected |= all_seeds(SCENES.items(), ["progressive 0.2"], "sift")
+    assert expected.items() <= settings(cells).items()
 
 
 # -- one cell ------------------------------------------------------------------------------------------------------

@@ -10,12 +10,14 @@ from kgs import DataError
 from kgs.datasets.synthetic import views_beyond
 from kgs.study.beyond import beyond_cell, beyond_cells
 from kgs.study.cells import sparse_cell
+from kgs.study.command import study
 from kgs.study.grid import read_rows, run_grid
 from kgs.study.overfitting import coadaptation
 from kgs.study.pairs import cells_frame
-from kgs.study.presets import select, sparse_cells
+from kgs.study.paper_tables import cells_of_table
+from kgs.study.presets import select, sparse_cells, with_steps
 from kgs.study.report import write_report
-from kgs.study.rivals import SelectiveDrop
+from kgs.study.rivals import SelectiveDrop, opacity_l1
 
 ROW = made_up("llff/fern", 3, "dense", "off", 0)
 LONGER = {"cell": ROW["cell"] | {"fit": {"steps": 10_000}}, "result": ROW["result"]}
@@ -55,6 +57,16 @@ CASES = [
         ("out, count", ValueError, lambda _, out=out, count=count: views_beyond("room", out, count, (6, 8)))
         for out, count in ((0.0, 6), (float("nan"), 6), (1.0, 0))
     ],
+    *[("steps", ValueError, lambda _, steps=steps: with_steps([tiny_cell()], steps)) for steps in (0, -1)],
+    ("steps", ValueError, lambda folder: study(out=folder, steps=0)),
+    *[
+        ("table", ValueError, lambda folder, table=table: cells_of_table([tiny_cell()], table, folder))
+        for table in (0, 7)
+    ],
+    ("FOLDER/colmap", DataError, lambda folder: cells_of_table([tiny_cell()], 2, folder)),  # has no scene of the table
+    ("table", ValueError, lambda folder: study(out=folder, table=1)),
+    ("opacities", ValueError, lambda _: opacity_l1(torch.rand(3, 1), torch.rand(3, 1))),
+    ("scores", ValueError, lambda _: opacity_l1(torch.rand(3), torch.rand(4))),
     ("cells", ValueError, lambda folder: run_grid([{"x": 1}, {"x": 1}], json.dumps, folder / "g.jsonl")),
     ("processes", ValueError, lambda folder: run_grid([{"x": 1}], json.dumps, folder / "g.jsonl", processes=0)),
     ("FOLDER/g.jsonl: line 1", ValueError, damaged_lines),

@@ -65,35 +65,18 @@ def test_finished_cells_are_not_repeated(tmp_path, threads):
     assert [row["cell"]["x"] for row in rows] == list(range(6))
 
 
-def test_a_line_cut_short_is_done_again(tmp_path, threads):
+@pytest.mark.parametrize("newline", [b"\n", b"\r\n"], ids=["unix", "windows"])
+@pytest.mark.parametrize(("cut", "kept"), [(0, 6), (1, 6), (9, 5)], ids=["whole", "without its end", "cut short"])
+def test_a_last_line_is_done_again_only_if_it_is_not_whole(tmp_path, threads, newline, cut, kept):
     path = tmp_path / "g.jsonl"
-    run_grid(CELLS, square, path, scheduler=threads, say=quiet)
-    content = path.read_text()
-    path.write_text(content[:-9])
-    assert len(read_rows(path)) == 5
+    content = newline.join(json.dumps({"cell": cell, "result": {"y": 7}}).encode() for cell in CELLS) + newline
+    path.write_bytes(content[: len(content) - cut])
+    assert len(read_rows(path)) == kept
     rows = run_grid(CELLS, square, path, scheduler=threads, say=quiet)
-    assert [row["result"]["y"] for row in rows] == [x**2 for x in range(6)]
-    assert sorted(path.read_text().splitlines()) == sorted(content.splitlines())
-
-
-def test_a_whole_last_line_without_its_end_is_kept(tmp_path, threads):
-    path = tmp_path / "g.jsonl"
-    path.write_text(json.dumps({"cell": CELLS[0], "result": {"y": 7}}))
-    rows = run_grid(CELLS[:2], square, path, scheduler=threads, say=quiet)
-    assert [row["result"]["y"] for row in rows] == [7, 1]
-    assert len(path.read_text().splitlines()) == 2
-
-
-def test_lines_that_end_as_on_windows_are_whole(tmp_path, threads):
-    path = tmp_path / "g.jsonl"
-    run_grid(CELLS, square, path, scheduler=threads, say=quiet)
-    content = path.read_bytes().replace(b"\n", b"\r\n")
-    for end in (0, 9):
-        path.write_bytes(content[: len(content) - end])
-        rows = run_grid(CELLS, square, path, scheduler=threads, say=quiet)
-        assert [row["result"]["y"] for row in rows] == [x**2 for x in range(6)]
-        assert len(path.read_bytes().splitlines()) == 6
-        assert path.read_bytes().startswith(content[: -9 * len(CELLS)])
+    assert [row["result"]["y"] for row in rows] == [7] * kept + [25] * (6 - kept)
+    assert len(path.read_bytes().splitlines()) == 6
+    assert path.read_bytes().startswith(content[: content.rindex(b'{"cell')])
+    assert len(read_rows(path)) == 6
 
 
 def test_a_file_belongs_to_one_run_at_a_time(tmp_path, threads):

@@ -2,7 +2,6 @@
 
 import json
 import math
-from collections import Counter
 
 import numpy as np
 import pytest
@@ -55,6 +54,16 @@ def stored(rows_of, tmp_path):
     return tmp_path / "stored" / "guard.jsonl"
 
 
+@pytest.fixture
+def report(stored, tmp_path):
+    """Writes the report of rows beside the stored ones."""
+
+    def write(rows, stored=stored):
+        return write_guard(rows, tmp_path / "new", "COMMAND", 40, stored)
+
+    return write
+
+
 def table(text, method=AUTO):
     """From a line's first cell and a head to the cell."""
     head, _, *lines = text.split(f"\n{method}:\n\n")[1].split("\n\n")[0].splitlines()
@@ -77,32 +86,25 @@ def keep(stored, wanted):
 
 
 def test_one_seed_of_three_methods_comes_first_and_what_tells_the_noise_last(cells):
-    first, last = cells[:24], cells[24:]
-    count = Counter((cell["scene"], cell["views"], cell["method"]) for cell in first)
-    assert count == {(*scene, method): 1 for scene in GUARD.items() for method in (AUTO, AUTO_OFF, PAPER)}
-    assert {cell["seed"] for cell in first} == {0}
-    assert Counter((cell["scene"], cell["seed"]) for cell in last) == {(s, k): 1 for s in GUARD for k in (1, 2)}
-    assert {cell["method"] for cell in last} == {AUTO}
+    first = [(*scene, method, 0) for scene in GUARD.items() for method in (AUTO, AUTO_OFF, PAPER)]
+    last = [(*scene, AUTO, seed) for seed in (1, 2) for scene in GUARD.items()]
+    found = [tuple(cell[key] for key in ("scene", "views", "method", "seed")) for cell in cells]
+    assert found == first + last
     assert {(cell["start"], cell["downscale"]) for cell in cells} == {("dense", 2.0)}
-
-
-def test_the_default_has_its_own_steps_and_the_paper_s_rule_few(cells):
     steps = {(cell["method"], cell["fit"]["steps"]) for cell in cells}
-    assert steps == {(AUTO, None), (AUTO_OFF, None), (PAPER, 700)}
+    assert steps == {(AUTO, None), (AUTO_OFF, None), (PAPER, 700)}  # None: the default's own
 
 
 def test_what_is_stored_are_the_cells_of_the_preset(cells):
-    rows = read_rows(STORED)
-    assert [row["cell"] for row in rows] == cells
+    assert [row["cell"] for row in read_rows(STORED)] == cells
     assert STORED.stat().st_size < 100_000
 
 
 # -- the report ---------------------------------------------------------------------------------------------------
 
 
-def test_changes_are_those_to_the_cell_of_the_same_seed(rows_of, stored, tmp_path):
-    new = rows_of(methods=(AUTO, PAPER), change=0.25, lpips=0.098, factor=1.1)
-    text = write_guard(new, tmp_path / "new", "COMMAND", 40, stored)
+def test_changes_are_those_to_the_cell_of_the_same_seed(rows_of, report, tmp_path):
+    text = report(rows_of(methods=(AUTO, PAPER), change=0.25, lpips=0.098, factor=1.1))
     assert (tmp_path / "new" / "guard.md").read_text(encoding="utf-8") == text.rstrip() + "\n"
     assert "Command: COMMAND." in text
     assert "4 of 40 cells, 4 of them with a stored one." in text
@@ -117,14 +119,14 @@ def test_changes_are_those_to_the_cell_of_the_same_seed(rows_of, stored, tmp_pat
         assert line["change of Gaussians [%]"] == "+0.0 (0.0)"
 
 
-def test_the_mean_has_the_noise_of_its_scenes_and_a_standard_error(rows_of, stored, tmp_path):
+def test_the_mean_has_the_noise_of_its_scenes_and_a_standard_error(rows_of, report):
     new = [*rows_of(scenes=(FERN,), change=0.4), *rows_of(scenes=(FLOWER,), change=0.2)]
-    found = table(write_guard(new, tmp_path / "new", "COMMAND", 40, stored))
+    found = table(report(new))
     expected = math.sqrt(noise(FERN) ** 2 + noise(FLOWER) ** 2) / 2
     assert found["mean of 2 scenes"]["change of PSNR [dB]"] == f"+0.30 ({expected:.2f})"
     assert found["mean of 2 scenes"]["PSNR [dB]"] == "23.30"
     assert found["standard error"]["change of PSNR [dB]"] == "0.10"  # half the distance of two numbers
-    assert "mean of 1 scenes" not in write_guard(new[:1], tmp_path / "one", "COMMAND", 40, stored)
+    assert list(table(report(new[:1]))) == [FERN]
 
 
 @pytest.mark.parametrize(
@@ -136,9 +138,9 @@ def test_the_mean_has_the_noise_of_its_scenes_and_a_standard_error(rows_of, stor
         (-2.1, " !", "Beyond noise in the mean: auto: PSNR [dB] -"),
     ],
 )
-def test_what_is_beyond_two_noises_is_marked(noises, mark, sentence, rows_of, stored, tmp_path):
+def test_what_is_beyond_two_noises_is_marked(noises, mark, sentence, rows_of, report):
     change = noises * noise(FERN)
-    text = write_guard(rows_of(scenes=(FERN,), change=change), tmp_path / "new", "COMMAND", 40, stored)
+    text = report(rows_of(scenes=(FERN,), change=change))
     assert table(text)[FERN]["change of PSNR [dB]"] == f"{change:+.2f} ({noise(FERN):.2f}){mark}"
     assert sentence in text
 
@@ -148,48 +150,42 @@ def test_what_is_beyond_two_noises_is_marked(noises, mark, sentence, rows_of, st
     [((0, 1, 2), (0, 1, 2), f" ({noise(FERN) / math.sqrt(3):.2f})"), ((0,), (0,), "")],
     ids=["more seeds have less noise", "one stored seed tells none"],
 )
-def test_the_noise_is_told_by_seeds(seeds, stored_seeds, noises, rows_of, stored, tmp_path):
+def test_the_noise_is_told_by_seeds(seeds, stored_seeds, noises, rows_of, report, stored):
     keep(stored, lambda cell: cell["seed"] in stored_seeds)
-    text = write_guard(rows_of(seeds=seeds, change=0.1), tmp_path / "new", "COMMAND", 40, stored)
+    text = report(rows_of(seeds=seeds, change=0.1))
     assert table(text)[FERN]["change of PSNR [dB]"] == f"+0.10{noises}"
     assert ("nothing stored to tell a change from noise by" in text) == (not noises)
 
 
-def test_unchanged_fits_have_no_change_and_no_mark(rows_of, stored, tmp_path):
-    new = rows_of(methods=(AUTO, AUTO_OFF, PAPER), seeds=(0, 1, 2))
-    text = write_guard(new, tmp_path / "new", "COMMAND", 40, stored)
+def test_unchanged_fits_have_no_change_and_no_mark(rows_of, report, stored, tmp_path):
+    text = report(rows_of(methods=(AUTO, AUTO_OFF, PAPER), seeds=(0, 1, 2)))
     assert "No mean has changed beyond noise." in text
     assert table(text)[FERN]["change of PSNR [dB]"].startswith("+0.00 (")
     assert " !" not in text.partition("\nauto:")[2]
     assert (tmp_path / "new" / "guard.jsonl").read_bytes() == stored.read_bytes()
 
 
-def test_without_stored_cells_there_are_values_alone(rows_of, tmp_path):
-    text = write_guard(rows_of(), tmp_path / "new", "COMMAND", 40, tmp_path / "none.jsonl")
-    assert list(table(text)[FERN]) == ["scene", "PSNR [dB]", "LPIPS", "seconds", "Gaussians"]
-    assert "There is nothing stored" in text
-    assert "0 of them with a stored one" in text
+def test_without_stored_cells_of_these_settings_there_are_values_alone(rows_of, report, tmp_path):
+    other_steps = rows_of()
+    for row in other_steps:
+        (row["cell"],) = with_steps([row["cell"]], 30)
+    for text in (report(rows_of(), tmp_path / "none.jsonl"), report(other_steps)):
+        assert list(table(text)[FERN]) == ["scene", "PSNR [dB]", "LPIPS", "seconds", "Gaussians"]
+        assert "There is nothing stored" in text
+        assert "0 of them with a stored one" in text
 
 
-def test_a_stored_cell_that_is_missing_leaves_its_scene_out_of_the_mean_change(rows_of, stored, tmp_path):
+def test_a_stored_cell_that_is_missing_leaves_its_scene_out_of_the_mean_change(rows_of, report, stored):
     keep(stored, lambda cell: cell["scene"] == "llff/fern")
-    found = table(write_guard(rows_of(change=0.3), tmp_path / "new", "COMMAND", 40, stored))
+    found = table(report(rows_of(change=0.3)))
     assert found[FLOWER]["change of PSNR [dB]"] == "-"
     assert found[FLOWER]["PSNR [dB]"] == "22.30"
     assert found["mean of 2 scenes"]["change of PSNR [dB]"] == f"+0.30 ({noise(FERN):.2f})"
     assert found["standard error"]["change of PSNR [dB]"] == "-"
 
 
-def test_fits_of_other_settings_are_not_compared(rows_of, stored, tmp_path):
-    new = rows_of()
-    for row in new:
-        (row["cell"],) = with_steps([row["cell"]], 30)
-    text = write_guard(new, tmp_path / "new", "COMMAND", 40, stored)
-    assert "change of PSNR [dB]" not in table(text)[FERN]
-
-
-def test_without_weights_lpips_is_left_out(rows_of, stored, tmp_path):
-    line = table(write_guard(rows_of(lpips=None), tmp_path / "new", "COMMAND", 40, stored))[FERN]
+def test_without_weights_lpips_is_left_out(rows_of, report):
+    line = table(report(rows_of(lpips=None)))[FERN]
     assert not [head for head in line if "LPIPS" in head]
     assert "change of PSNR [dB]" in line
 

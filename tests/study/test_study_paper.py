@@ -4,7 +4,6 @@ from itertools import product
 
 import pytest
 
-from kgs import DataError
 from kgs.study import presets
 from kgs.study.command import study
 from kgs.study.paper_tables import TABLES, cells_of_table
@@ -56,21 +55,3 @@ def test_a_table_joins_the_other_choices(data, monkeypatch, tmp_path, capsys):
     assert capsys.readouterr().out.splitlines() == ["to do: llff/fern, 3 views, dense, off, seed 0", "0 of 1 are done"]
     with pytest.raises(ValueError, match=r"^methods: .*'far'"):
         study(out=tmp_path / "out", preset="paper", table=4, methods=("far",), list_cells=True)
-
-
-def test_a_table_without_a_scene_names_the_folder(data):
-    cells = [cell for cell in presets.sparse_cells("paper", data) if cell["scene"] != "colmap/kitchen"]
-    with pytest.raises(DataError, match="Mip-NeRF 360") as error:
-        cells_of_table(cells, 2, data)
-    assert error.value.path == data / "colmap"
-
-
-@pytest.mark.parametrize("table", [0, 7])
-def test_a_table_that_is_not_there(data, table):
-    with pytest.raises(ValueError, match=f"^table: .* got {table}$"):
-        cells_of_table(presets.sparse_cells("paper", data), table, data)
-
-
-def test_a_table_of_another_preset_is_refused_before_any_work(tmp_path):
-    with pytest.raises(ValueError, match=r"^table: .*'paper'.*'quick'"):
-        study(out=tmp_path, table=1)
