@@ -15,6 +15,7 @@ from hypothesis import settings
 from init_point_scenes import painted_planes
 from optional_packages import pytest_pycollect_makemodule  # noqa: F401
 from tables import pytest_addoption, pytest_configure, pytest_terminal_summary  # noqa: F401  # --tables
+from yard import on_arc, yard_views
 
 from kgs import backends
 from kgs.app.files import film
@@ -117,7 +118,7 @@ def _short_films() -> Iterator[None]:
 def _synthetic_worlds_are_made_once() -> Iterator[None]:
     """Keep all of them, not the last two: each takes a second."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(synthetic, "_make_setup", functools.cache(synthetic._make_setup.__wrapped__))
+        patch.setattr(synthetic, "_make_world", functools.cache(synthetic._make_world.__wrapped__))
         yield
 
 
@@ -172,10 +173,11 @@ def planes():
 
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory):
-    """The synthetic orbit scene as a Blender folder."""
+    """Four views around the boxes of a yard, and two between them, as a Blender folder."""
     root = tmp_path_factory.mktemp("scene")
-    scene = synthetic_scene("orbit", train_views=4, test_views=2, size=(36, 40), seed=0)
-    for split, views in (("train", scene.train), ("test", scene.test)):
+    around = {"train": np.radians([0.0, 90.0, 180.0, 270.0]), "test": np.radians([40.0, 220.0])}
+    for split, angles in around.items():
+        views = yard_views(on_arc(angles, np.full(len(angles), 0.35)), (36, 40))
         (root / split).mkdir()
         frames = []
         for i, image in enumerate(views.images):

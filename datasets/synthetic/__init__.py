@@ -1,16 +1,13 @@
-"""A synthetic scene with exact poses and exact depth: a table with books, a lamp, a plant and a mug.
+"""A synthetic scene with exact poses and exact depth: a table with books, a lamp, a plant and a mug, in a room.
 
-It stands in a room, to be photographed from the front, or in a garden, to be photographed from all around, or from an
-arc and before a sky at the horizon. Meshes are trimesh's; `raycast` finds the first surface of each pixel, where a
-procedural texture is evaluated: nothing of kgs takes part in making the images. Four rays per pixel are averaged. The
-world depends on `kind` and `seed` only, never on the cameras.
+Meshes are trimesh's; `raycast` finds the first surface of each pixel, where a procedural texture is evaluated: nothing
+of kgs takes part in making the images. Four rays per pixel are averaged. The world depends on the seed only, never on
+the cameras.
 """
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -20,48 +17,31 @@ from torch import Tensor
 
 from kgs.datasets.scene import Scene, Views, pinholes
 
-from . import garden, room
+from . import room
 from .raycast import Array, raycast
 from .world import World
 
-KINDS = ("room", "orbit", "arc")
 SUPERSAMPLING = 2  # rays along each side of a pixel
-ARC_RADIUS = 2.6  # m from the middle of the arc's cameras to what they look at
-ARC_SPAN = np.radians(25.0)  # half the angle over which the arc's cameras extend
-ARC_HEIGHT = 0.12  # m: half their extent up and down
-ARC_CENTER = garden.CENTER + np.array([0.0, -0.2, 0.0])  # what they look at: the horizon is in the middle of the image
-
-
-class _Setup(NamedTuple):
-    """A world, and how it is photographed."""
-
-    world: World
-    eyes: Callable[[int, int, np.random.Generator], tuple[Array, Array]]  # of so many training and test cameras
-    beyond: Callable[[int, float], Array]  # eyes of so many cameras, so many times as far out as the training cameras
-    center: Array  # (3,), what they look at
-    focal: float  # focal length over the longer side of the image
 
 
 def synthetic_scene(
-    kind: str = "room", train_views: int = 3, test_views: int = 6, size: tuple[int, int] = (126, 168), seed: int = 0
+    train_views: int = 3, test_views: int = 6, size: tuple[int, int] = (126, 168), seed: int = 0
 ) -> Scene:
     """Make a scene in some seconds, without any file.
+
+    Cameras face the table from a small patch, the test views between the training views and a little outside of them.
 
     Convention:
         Kornia's: world-to-camera extrinsics with OpenCV axes, integer pixel centres (cx = (W - 1) / 2). Float32.
 
     Args:
-        kind: "room": forward-facing cameras on a small patch before the table in a room, the test views between the
-            training views and a little outside of them. "orbit": cameras on a circle around the table in a garden,
-            which look inwards, the test views between the training views. "arc": cameras on an arc of 50 degrees
-            before the table in the garden, under a sky that is as good as infinitely far away.
         train_views: at least 1.
         test_views: at least 0.
         size: (height, width) of all images in pixels. The field of view is 58 degrees along the longer side.
         seed: of positions, textures and cameras, at least 0. The same seed gives the same scene, without points.
 
     Raises:
-        ValueError: the kind is unknown, or a number is out of range.
+        ValueError: a number is out of range.
     """
     for name, value, minimum in (
         ("train_views", train_views, 1),
@@ -71,55 +51,37 @@ def synthetic_scene(
     ):
         if value < minimum:
             raise ValueError(f"{name}: expected at least {minimum}, got {value}")
-    setup = _setup(kind, seed)
-    train_eyes, test_eyes = setup.eyes(train_views, test_views, np.random.default_rng([seed, 1]))
+    world = _make_world(seed)
+    train_eyes, test_eyes = _patch_eyes(train_views, test_views, np.random.default_rng([seed, 1]))
     with torch.device("cpu"):  # whatever torch's default is
-        train = _views(setup, train_eyes, size, "train")
-        test = _views(setup, test_eyes, size, "test")
+        train = _views(world, train_eyes, size, "train")
+        test = _views(world, test_eyes, size, "test")
         no_points = torch.zeros(0, 3, dtype=torch.float32)
         black = torch.zeros(3, dtype=torch.float32)
         return Scene(train, test, no_points, no_points, "none", black.double(), black, Path("synthetic"))
 
 
-def synthetic_views(
-    eyes: NDArray[np.float64], kind: str = "room", size: tuple[int, int] = (126, 168), seed: int = 0
-) -> Views:
-    """Images of the synthetic scene from given positions; all cameras are upright and look at the middle of the scene.
-
-    Args:
-        eyes: positions of the cameras relative to the middle of the scene, `(V, 3)`; y points down.
-        kind: as given to `synthetic_scene`.
-        size: as given to `synthetic_scene`.
-        seed: as given to `synthetic_scene`.
-    """
-    setup = _setup(kind, seed)
-    return _views(setup, setup.center + eyes, size, "photo")
-
-
-def views_beyond(kind: str, out: float, count: int = 6, size: tuple[int, int] = (126, 168), seed: int = 0) -> Views:
+def views_beyond(out: float, count: int = 6, size: tuple[int, int] = (126, 168), seed: int = 0) -> Views:
     """Images of the synthetic scene from positions `out` times as far from the middle of the training cameras as these.
 
-    The positions are evenly spread over an ellipse whose half axes are those of the patch of the training cameras (of
-    the arc: an angle around the table, and a height), times `out`. Of the "orbit" it is a circle `out` times as large.
-    All cameras look at the middle of the scene.
+    The positions are evenly spread over an ellipse whose half axes are those of the patch of the training cameras,
+    times `out`. All cameras look at the middle of the scene.
 
     Args:
-        kind: as given to `synthetic_scene`.
         out: > 0; 1 is as far as the training cameras.
         count: of cameras, at least 1.
         size: as given to `synthetic_scene`.
         seed: as given to `synthetic_scene`.
 
     Raises:
-        ValueError: the kind is unknown, or a number is out of range.
+        ValueError: a number is out of range.
     """
     if not 0.0 < out < np.inf or count < 1:
         raise ValueError(f"out, count: expected a number > 0 and at least one camera, got {out} and {count}")
-    setup = _setup(kind, seed)
-    return _views(setup, setup.beyond(count, out), size, "beyond")
+    return _views(_make_world(seed), room.EYE + out * _ellipse(count) * room.PATCH, size, "beyond")
 
 
-def synthetic_depths(cameras: PinholeCamera, kind: str = "room", seed: int = 0) -> Tensor:
+def synthetic_depths(cameras: PinholeCamera, seed: int = 0) -> Tensor:
     """The true depth of the synthetic scene at the pixel centres of any cameras.
 
     Convention:
@@ -127,75 +89,62 @@ def synthetic_depths(cameras: PinholeCamera, kind: str = "room", seed: int = 0) 
 
     Args:
         cameras: for example `scene.train.cameras`, all of one image size.
-        kind: as given to `synthetic_scene`.
         seed: as given to `synthetic_scene`.
 
     Returns:
         Float64, `(C, 1, H, W)`; 0 where a camera sees past the scene.
 
     Raises:
-        ValueError: the kind is unknown, or the cameras differ in image size.
+        ValueError: the cameras differ in image size.
     """
     sizes = set(zip(cameras.height.int().tolist(), cameras.width.int().tolist(), strict=True))
     if len(sizes) != 1:
         raise ValueError(f"cameras: expected one image size, got {sorted(sizes)}")
     size = sizes.pop()
-    triangles = _setup(kind, seed).world.triangles
+    triangles = _make_world(seed).triangles
     matrices = zip(cameras.intrinsics.double().cpu(), cameras.extrinsics.double().cpu(), strict=True)
     depths = [raycast(triangles, k.numpy(), e.numpy(), size)[0] for k, e in matrices]
     return torch.from_numpy(np.stack(depths)[:, None])
 
 
-def _setup(kind: str, seed: int) -> _Setup:
-    if kind not in KINDS:
-        raise ValueError(f"kind: expected one of {KINDS}, got {kind!r}")
-    return _make_setup(kind, seed)
+_make_world = lru_cache(maxsize=2)(room.make_room)
 
 
-@lru_cache(maxsize=2)
-def _make_setup(kind: str, seed: int) -> _Setup:
-    if kind == "room":
-        return _Setup(room.make_room(seed), _patch_eyes, _eyes_beyond_patch, room.CENTER, room.FOCAL)
-    if kind == "arc":
-        far = garden.make_garden(seed, far_sky=True)
-        return _Setup(far, _arc_eyes, _eyes_beyond_arc, ARC_CENTER, garden.FOCAL)
-    return _Setup(garden.make_garden(seed), _orbit_eyes, _eyes_beyond_orbit, garden.CENTER, garden.FOCAL)
-
-
-def _views(setup: _Setup, eyes: Array, size: tuple[int, int], split: str) -> Views:
+def _views(world: World, eyes: Array, size: tuple[int, int], split: str) -> Views:
+    """Images of a world from some positions `(V, 3)`; all cameras are upright and look at the middle of the scene."""
     (height, width) = size
     count = len(eyes)
     intrinsics = torch.eye(4, dtype=torch.float32).repeat(count, 1, 1)
-    intrinsics[:, 0, 0] = intrinsics[:, 1, 1] = setup.focal * max(size)
+    intrinsics[:, 0, 0] = intrinsics[:, 1, 1] = room.FOCAL * max(size)
     intrinsics[:, 0, 2] = (width - 1) / 2
     intrinsics[:, 1, 2] = (height - 1) / 2
     extrinsics = torch.zeros(count, 4, 4, dtype=torch.float32)
     for i, eye in enumerate(eyes):
         # poses are rounded to float32 before rendering, so that the images are exactly those of the cameras
-        extrinsics[i] = torch.from_numpy(_look_at(eye, setup.center))
-    setup.world.prepare()
+        extrinsics[i] = torch.from_numpy(_look_at(eye, room.CENTER))
+    world.prepare()
     images = np.zeros((count, 3, height, width), dtype=np.float32)
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         cameras = intrinsics.double().numpy(), extrinsics.double().numpy()
-        drawn = pool.map(lambda matrix, pose: _render(setup, matrix, pose, size), *cameras)
+        drawn = pool.map(lambda matrix, pose: _render(world, matrix, pose, size), *cameras)
         for i, image in enumerate(drawn):
             images[i] = image
     names = tuple(f"{split}_{i:02d}" for i in range(count))
     return Views(pinholes(intrinsics, extrinsics, size), torch.from_numpy(images), names)
 
 
-def _render(setup: _Setup, intrinsics: Array, extrinsics: Array, size: tuple[int, int]) -> NDArray[np.float32]:
+def _render(world: World, intrinsics: Array, extrinsics: Array, size: tuple[int, int]) -> NDArray[np.float32]:
     """The image `(3, H, W)`: the mean over rays spread evenly over the square of each pixel."""
     s = SUPERSAMPLING
     fine = intrinsics[:3, :3].copy()
     fine[:2] *= s
     fine[:2, 2] += (s - 1) / 2  # the middle of s fine pixels is the centre of the coarse one
-    depths, faces = raycast(setup.world.triangles, fine, extrinsics, (size[0] * s, size[1] * s))
+    depths, faces = raycast(world.triangles, fine, extrinsics, (size[0] * s, size[1] * s))
     v, u = np.nonzero(faces >= 0)
     rays = np.stack([u, v, np.ones_like(u)], axis=-1).astype(np.float64) @ np.linalg.inv(fine).T
     points = (rays * depths[v, u, None] - extrinsics[:3, 3]) @ extrinsics[:3, :3]
     colors = np.zeros((*faces.shape, 3), dtype=np.float32)
-    colors[v, u] = setup.world.shade(points, faces[v, u])
+    colors[v, u] = world.shade(points, faces[v, u])
     total = sum(colors[i::s, j::s] for i in range(s) for j in range(s))
     image: NDArray[np.float32] = np.asarray(total / np.float32(s * s), np.float32).transpose(2, 0, 1)
     return image
@@ -203,58 +152,13 @@ def _render(setup: _Setup, intrinsics: Array, extrinsics: Array, size: tuple[int
 
 def _patch_eyes(train: int, test: int, rng: np.random.Generator) -> tuple[Array, Array]:
     """Training cameras in a zigzag from left to right, test cameras spread over a patch 1.15 times as large."""
-    flat = _zigzag(train, test, rng)
-    eyes = room.EYE + room.PATCH * np.concatenate([flat, rng.uniform(-1.0, 1.0, size=(train + test, 1))], axis=1)
-    return eyes[:train], eyes[train:]
-
-
-def _eyes_beyond_patch(count: int, out: float) -> Array:
-    return np.asarray(room.EYE + out * _ellipse(count) * room.PATCH)
-
-
-def _arc_eyes(train: int, test: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """As `_patch_eyes`, on an arc around the table."""
-    eyes = _on_arc(_zigzag(train, test, rng))
-    return eyes[:train], eyes[train:]
-
-
-def _eyes_beyond_arc(count: int, out: float) -> Array:
-    return _on_arc(out * _ellipse(count)[:, :2])
-
-
-def _on_arc(flat: Array) -> Array:
-    """Positions `(n, 3)` of coordinates `(n, 2)` along the arc and up, in halves of its extent."""
-    angles = ARC_SPAN * flat[:, 0]
-    heights = ARC_HEIGHT * flat[:, 1]
-    return np.asarray(ARC_CENTER + ARC_RADIUS * np.stack([np.sin(angles), heights / ARC_RADIUS, -np.cos(angles)], -1))
-
-
-def _orbit_eyes(train: int, test: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Training cameras all around at equal angles, test cameras in the middle half of the gaps between them."""
-    gaps = np.arange(test) * train // max(test, 1) + rng.uniform(0.25, 0.75, size=test)
-    angles = 2 * np.pi / train * np.concatenate([np.arange(train), gaps])
-    heights = garden.HEIGHT + rng.uniform(-0.15, 0.15, size=train + test)
-    eyes = _on_circle(angles, heights, garden.RADIUS)
-    return eyes[:train], eyes[train:]
-
-
-def _eyes_beyond_orbit(count: int, out: float) -> Array:
-    angles = 2 * np.pi * (np.arange(count) + 0.5) / count
-    return _on_circle(angles, np.full(count, garden.HEIGHT), out * garden.RADIUS)
-
-
-def _on_circle(angles: Array, heights: Array, radius: float) -> Array:
-    """Positions `(n, 3)` around the table; heights are above `garden.CENTER`."""
-    away = np.stack([radius * np.sin(angles), -heights, -radius * np.cos(angles)], axis=-1)
-    return np.asarray(garden.CENTER + away)
-
-
-def _zigzag(train: int, test: int, rng: np.random.Generator) -> Array:
-    """Coordinates `(train + test, 2)`: a zigzag in [-1, 1] x [-0.5, 0.5], and points spread over a square of 1.15."""
     x = np.linspace(-1.0, 1.0, train) if train > 1 else np.zeros(1)
+    zigzag = np.stack([x, np.where(np.arange(train) % 2, 0.5, -0.5)], axis=-1)
     # M. Roberts' R2 sequence: evenly spread, however many there are
     spread = (rng.uniform(size=2) + np.outer(np.arange(test), [0.7548776662466927, 0.5698402909980532])) % 1.0
-    return np.concatenate([np.stack([x, np.where(np.arange(train) % 2, 0.5, -0.5)], -1), 1.15 * (2.0 * spread - 1.0)])
+    flat = np.concatenate([zigzag, 1.15 * (2.0 * spread - 1.0)])
+    eyes = room.EYE + room.PATCH * np.concatenate([flat, rng.uniform(-1.0, 1.0, size=(train + test, 1))], axis=1)
+    return eyes[:train], eyes[train:]
 
 
 def _ellipse(count: int) -> Array:

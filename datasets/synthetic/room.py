@@ -30,7 +30,7 @@ def make_room(seed: int) -> World:
     """The room of a seed."""
     rng = np.random.default_rng([seed, 2])
     shell = _shell(rng)
-    return make_world(shell, things(rng), SUN, SKY)
+    return make_world(shell, _things(rng), SUN, SKY)
 
 
 def _shell(rng: np.random.Generator) -> list[Instance]:
@@ -50,7 +50,7 @@ def _shell(rng: np.random.Generator) -> list[Instance]:
     ]
 
 
-def things(rng: np.random.Generator) -> list[Instance]:
+def _things(rng: np.random.Generator) -> list[Instance]:
     """The table with what stands on it, and a ball under it, each a little off the position that is given here."""
     instances = put(make.table(rng, 1.7, 0.62, TABLE), 0.0, 1.75)
     titles = rng.permutation(TITLES)

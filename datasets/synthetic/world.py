@@ -41,10 +41,9 @@ class World:
     owners: Index  # (F,), the part a triangle belongs to
     frames: tuple[Array, ...]  # a (4, 4) rigid matrix for each part, from its own frame to the world
     textures: tuple[Texture, ...]
-    shell: int  # the first `shell` triangles (ground, walls, sky) cast no shadow
+    shell: int  # the first `shell` triangles (floor, walls) cast no shadow
     sun: Array  # (3,), towards the sun
     sky: Array  # (3,), towards the middle of the sky
-    unlit: int  # the first `unlit` triangles are not lit: their colours are those of their textures
 
     def prepare(self) -> None:
         """Make what all images share; threads that draw images would each make it for themselves."""
@@ -83,7 +82,6 @@ class World:
             chunk = slice(start, start + CHUNK)
             face = faces[chunk]
             light = received(self.lights, points[chunk], self._normals_at(points[chunk], face))
-            light[face < self.unlit] = 1.0
             colors[chunk] *= light**GAMMA
         return colors.clip(0.0, 1.0, out=colors)
 
@@ -105,11 +103,9 @@ class World:
                 yield owner, order[start : min(start + CHUNK, stop)]
 
 
-def make_world(
-    shell: Sequence[Instance], things: Sequence[Instance], sun: Array, sky: Array, unlit: Sequence[Instance] = ()
-) -> World:
-    """A world of things in a shell, which casts no shadow, and of unlit parts, which cast none either."""
-    instances = [*unlit, *shell, *things]
+def make_world(shell: Sequence[Instance], things: Sequence[Instance], sun: Array, sky: Array) -> World:
+    """A world of things in a shell, which casts no shadow."""
+    instances = [*shell, *things]
     meshes, frames, textures = zip(*instances, strict=True)
     triangles = [mesh.triangles @ frame[:3, :3].T + frame[:3, 3] for mesh, frame in zip(meshes, frames, strict=True)]
     normals = [_normals(mesh) @ frame[:3, :3].T for mesh, frame in zip(meshes, frames, strict=True)]
@@ -120,10 +116,9 @@ def make_world(
         np.repeat(np.arange(len(meshes)), sizes),
         frames,
         textures,
-        shell=sum(sizes[: len(unlit) + len(shell)]),
+        shell=sum(sizes[: len(shell)]),
         sun=sun,
         sky=sky,
-        unlit=sum(sizes[: len(unlit)]),
     )
 
 

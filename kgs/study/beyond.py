@@ -1,6 +1,6 @@
 """Beyond the photos: what cameras see that lie farther out than those of the training views.
 
-Of synthetic scenes the truth is known everywhere: cameras 1, 2 and 3 times as far from the middle of the training
+Of the synthetic room the truth is known everywhere: cameras 1, 2 and 3 times as far from the middle of the training
 cameras as these, over the pixels whose surface a training view shows. Of real scenes the outermost photos are held out
 and the most central ones are trained on.
 """
@@ -34,13 +34,13 @@ from .cells import fit_and_measure, fit_config, load_lpips
 from .grid import Cell
 from .presets import AUTO
 
-WORLDS = {"room": 3, "arc": 6}  # the synthetic scenes and their training views
+ROOM, ROOM_VIEWS = "room", 3  # the synthetic scene and its training views
 PHOTOS = {"llff/fern": 3, "colmap/trex": 3, "nerfstudio/fox": 12}  # the real scenes and theirs
 OUT = (1, 2, 3)  # distances from the middle of the training cameras, over theirs
-SIZE = (189, 252)  # pixels of the synthetic views, height and width
+SIZE = (189, 252)  # pixels of the room's views, height and width
 CAMERAS = 6  # at each of these distances
 OUTER = 0.25  # share of a real scene's photos that are held out
-_FITS = {True: {"steps": 500, "sh_degree": 0}, False: {"steps": 1000, "sh_degree": 0}}  # of synthetic and real scenes
+_FITS = {True: {"steps": 500, "sh_degree": 0}, False: {"steps": 1000, "sh_degree": 0}}  # of the room and of real scenes
 
 
 class Target(NamedTuple):
@@ -51,20 +51,20 @@ class Target(NamedTuple):
 
 
 def beyond_cells(data: Path | None) -> list[Cell]:
-    """The cells of the preset: three seeds of the synthetic scenes, then, with a folder `data`, of the real ones.
+    """The cells of the preset: three seeds of the room, then, with a folder `data`, of the real ones.
 
     DataError: `data` lacks a scene.
     """
-    scenes: list[tuple[str, int]] = [*WORLDS.items()]
+    scenes: list[tuple[str, int]] = [(ROOM, ROOM_VIEWS)]
     if data is not None:
         check_scenes(data, PHOTOS)
         scenes += PHOTOS.items()
     cells = [_cell(scene, views, seed) for seed, (scene, views) in product(range(3), scenes)]
-    return sorted(cells, key=lambda cell: cell["scene"] not in WORLDS)  # stable: by seed within each part
+    return sorted(cells, key=lambda cell: cell["scene"] != ROOM)  # stable: by seed within each part
 
 
 def _cell(scene: str, views: int, seed: int) -> Cell:
-    synthetic = scene in WORLDS
+    synthetic = scene == ROOM
     return {
         "scene": scene,
         "views": views,
@@ -76,10 +76,10 @@ def _cell(scene: str, views: int, seed: int) -> Cell:
 
 
 def beyond_cell(cell: Cell, data: str | None = None, lpips_weights: str | None = None) -> dict[str, Any]:
-    """Fit once, and measure test views and, of a synthetic scene, the views beyond the photos.
+    """Fit once, and measure test views and, of the room, the views beyond the photos.
 
     Args:
-        cell: "scene" (of `WORLDS`, or a folder below `data`), "views", "downscale", "method" (a name, for the report),
+        cell: "scene" (`ROOM`, or a folder below `data`), "views", "downscale", "method" (a name, for the report),
             "seed", and "fit": the fields of FitConfig that are not those of the default.
         data: the folder of the real scenes; DataError: the scene is not there or damaged.
         lpips_weights: a folder with the weights of VGG16 and LPIPS, or None to leave LPIPS out.
@@ -93,24 +93,24 @@ def beyond_cell(cell: Cell, data: str | None = None, lpips_weights: str | None =
     points = choose_points(scene, config)
     lpips = load_lpips(lpips_weights)
     _, fit, stored = fit_and_measure(scene, config, points, lpips)
-    targets = synthetic_targets(cell["scene"], scene) if cell["scene"] in WORLDS else {}
+    targets = room_targets(scene) if cell["scene"] == ROOM else {}
     stored["beyond"] = {str(out): measure_target(fit.render, target, lpips) for out, target in targets.items()}
     return stored
 
 
-def synthetic_targets(kind: str, scene: Scene) -> dict[int, Target]:
-    """For each distance of `OUT` the views of a synthetic scene from there, and the pixels that count.
+def room_targets(scene: Scene) -> dict[int, Target]:
+    """For each distance of `OUT` the views of the room from there, and the pixels that count.
 
     A pixel counts if at least one training view shows its surface: by exact depths, see `views_that_show`.
     """
     train = scene.train
     height, width = train.images.shape[-2:]
-    train_depths = list(synthetic_depths(train.cameras, kind)[:, 0])
+    train_depths = list(synthetic_depths(train.cameras)[:, 0])
     targets = {}
     for out in OUT:
-        views = views_beyond(kind, out, CAMERAS, (height, width))
+        views = views_beyond(out, CAMERAS, (height, width))
         shown = []
-        for i, depth in enumerate(synthetic_depths(views.cameras, kind)[:, 0]):
+        for i, depth in enumerate(synthetic_depths(views.cameras)[:, 0]):
             shown.append(views_that_show(depth, views.camera(i), train_depths, train.cameras) > 0)
         targets[out] = Target(views, shown)
     return targets
@@ -168,8 +168,8 @@ def from_the_middle(scene: Scene, count: int) -> Scene:
 
 @lru_cache(maxsize=1)
 def _scene(name: str, views: int, downscale: float | None, data: str | None) -> Scene:
-    if name in WORLDS:
-        return synthetic_scene(name, views, CAMERAS, SIZE)
+    if name == ROOM:
+        return synthetic_scene(views, CAMERAS, SIZE)
     if data is None:
         raise DataError(name, "", "expected the environment variable KGS_DATA to name the folder of this scene")
     return from_the_middle(load_scene(Path(data) / name, downscale=downscale, hold_out=0), views)

@@ -8,7 +8,7 @@ import pandas as pd
 
 from kgs.bench.output import mean_sd
 
-from .beyond import CAMERAS, OUT, OUTER, WORLDS
+from .beyond import CAMERAS, OUT, OUTER, ROOM
 from .pairs import frame_of, grouped
 from .texts import counts, document, table_of
 
@@ -50,10 +50,10 @@ def write_beyond(rows: Sequence[Mapping[str, Any]], out: Path, command: str, pla
     frame = frame_of(rows, _NUMBERS).astype(dict.fromkeys(_NUMBERS, float))
     commits = counts(row["result"].get("revision") or "of no known commit" for row in rows)
     sentences = [f"Command: {command}.", f"{len(rows)} of {planned} cells; by commit of kgs: {commits}.", *_NOTES]
-    is_synthetic = frame.scene.isin(WORLDS)
+    is_room = frame.scene == ROOM
     tables = {
-        "Synthetic scenes": _table(frame[is_synthetic], _SYNTHETIC),
-        "Real scenes": _table(frame[~is_synthetic], _REAL),
+        "Synthetic scene": _table(frame[is_room], _SYNTHETIC),
+        "Real scenes": _table(frame[~is_room], _REAL),
     }
     text = document(TITLE, sentences, {title: table for title, table in tables.items() if len(table)})
     out.mkdir(parents=True, exist_ok=True)
@@ -70,7 +70,7 @@ def _table(frame: pd.DataFrame, heads: Mapping[str, tuple[str, str | None]]) -> 
             line[head] = mean_sd(cells[psnr], 2)
             if lpips is not None and cells[lpips].count():
                 line[head] += f"; {mean_sd(cells[lpips], 3)}"
-        if scene in WORLDS:
+        if scene == ROOM:
             line["share"] = ", ".join(f"{share:.2f}" for share in cells[_SHARES].iloc[0])
         line["Gaussians"] = mean_sd(cells.gaussians, 0)
         line["seconds"] = mean_sd(cells.wall_seconds, 0)

@@ -45,7 +45,7 @@ def study(
         preset: quick takes minutes on the built-in scene; cpu hours on the six scenes of KGS_DATA;
             field hours on the same and more in full size, field-long on three of them with 10 000 steps; paper is the
             paper's 10 000 steps on every scene there in the size of published tables, for a large machine; beyond
-            measures the default from cameras farther out than the photos', on two built-in scenes in minutes, with
+            measures the default from cameras farther out than the photos', on the built-in room in minutes, with
             KGS_DATA on three more; guard tells in about 25 minutes on two cores, with KGS_DATA, whether a change of the
             code has changed the fits of eight scenes: guard.md has them beside stored ones, with the noise of each.
         processes: fits at a time, one per core unless given; the seconds of a fit hold for that many at a time.

@@ -69,7 +69,7 @@ def test_metrics_have_the_agreed_keys_and_say_what_the_splat_and_config_do(fitte
     assert set(metrics["test"]) == {"psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled", "views"}
     assert metrics["test"]["lpips_vgg"] is None
     assert set(metrics["curve"][-1]) == {"step", "seconds", "test_psnr", "train_psnr"}
-    assert metrics["curve"][-1]["test_psnr"] == pytest.approx(metrics["test"]["psnr"], abs=1e-2)  # before pruning
+    assert metrics["curve"][-1]["train_psnr"] == pytest.approx(metrics["train"]["psnr"], abs=1e-2)  # before pruning
     assert (metrics["steps"], metrics["drop"]) == (STEPS, DROP)
     assert metrics["init"] == {"kind": "random", "points": 10_000}
     model = kgs.load_ply(fitted / "splat.ply")

@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from init_point_scenes import as_views, garden_from_above
+from init_point_scenes import as_views
+from yard import yard_from_above
 
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.border import find_border_mask
@@ -89,7 +90,7 @@ def test_a_border_has_no_part_in_a_fit(scene):
 @pytest.mark.slow
 def test_a_fit_renders_the_scene_without_the_border(scene):
     """A fit that knows of the border is as bright at the edge as one of photos without; else it is dark there."""
-    views, _ = garden_from_above((144, 192))
+    views, _ = yard_from_above((144, 192))
     scene = replace(scene, train=views, test=views.select([0]))
     light, points = behind(left=3.0, top=0.0, right=0.0), choose_points(scene, FitConfig(init="sift"))
     edges = []

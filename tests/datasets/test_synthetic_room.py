@@ -22,12 +22,12 @@ def made():
 
 @pytest.fixture(scope="module")
 def scene():
-    return synthetic_scene("room", 3, 5, SIZE)
+    return synthetic_scene(3, 5, SIZE)
 
 
 @pytest.fixture(scope="module")
 def depths(scene):
-    return synthetic_depths(scene.train.cameras, "room")
+    return synthetic_depths(scene.train.cameras)
 
 
 @pytest.mark.slow

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from yard import yard_scene
 
 from kgs import backends
-from kgs.datasets import synthetic_scene
 
 HERE = Path(__file__).parent
 
@@ -23,4 +23,4 @@ def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
 
 @pytest.fixture(scope="session")
 def arc():
-    return synthetic_scene("arc", train_views=6, test_views=2, size=(72, 96))
+    return yard_scene()

@@ -20,7 +20,7 @@ from kgs.types import RasterOptions
 @pytest.fixture(scope="module")
 def scene():
     """Three photos of a wall."""
-    room = synthetic_scene("room", train_views=3, test_views=1, size=(48, 64))
+    room = synthetic_scene(train_views=3, test_views=1, size=(48, 64))
     fit = wall(room)
     photos = torch.cat([fit.render(room.train.camera(i)) for i in range(3)]).detach()
     return replace(room, train=replace(room.train, images=photos))
@@ -92,7 +92,7 @@ def test_the_dark_channel_is_the_least_number_of_a_window():
 
 
 def test_a_fit_fades_veils_and_the_papers_recipe_does_not(monkeypatch):
-    scene = synthetic_scene("room", train_views=3, test_views=1, size=(24, 32))
+    scene = synthetic_scene(train_views=3, test_views=1, size=(24, 32))
     faded = []
     monkeypatch.setattr("kgs.fit.trainer.veils", lambda fit: torch.arange(len(fit.model)) == 0)
     monkeypatch.setattr(

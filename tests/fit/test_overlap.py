@@ -31,7 +31,7 @@ OPEN = FitConfig(evaluations=1)
 
 @pytest.fixture(scope="module")
 def scene():
-    return synthetic_scene("room", train_views=8, test_views=1, size=(24, 32))
+    return synthetic_scene(train_views=8, test_views=1, size=(24, 32))
 
 
 def points_seen_by(photos: float, views: int = 8, count: int = 1000):
@@ -114,7 +114,7 @@ def test_a_fit_goes_on_as_it_was_decided(scene, tmp_path):
 
 def test_a_whole_fit_says_what_it_decided():
     """Eight photos of the room, all of which show most patches."""
-    large = synthetic_scene("room", train_views=8, test_views=1, size=(96, 128))
+    large = synthetic_scene(train_views=8, test_views=1, size=(96, 128))
     fit = fit_scene(large, FitConfig(steps=4, evaluations=1))
     found = fit.decisions.overlap
     assert 3 <= found.views_per_pair <= found.views_per_patch <= 8

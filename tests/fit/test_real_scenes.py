@@ -60,8 +60,9 @@ def test_dropping_gains_over_seeds():
     assert statistics.mean(gains) >= 2 * statistics.stdev(gains) / math.sqrt(len(gains))
 
 
-def test_the_demo_shows_a_room(tmp_path):
-    """Views that were not used, from three photos: better than any blur of them."""
-    assert run("demo", "-o", tmp_path) == 0
+@pytest.mark.parametrize("scene", ["bananas", "room"])
+def test_the_demo_shows_its_scene(scene, tmp_path):
+    """Views that were not used, from few photos: better than any blur of them."""
+    assert run("demo", "-o", tmp_path, "--scene", scene) == 0
     runs = json.loads((tmp_path / "metrics.json").read_text())
     assert min(run["test"]["psnr"] for run in runs.values()) >= 25.0

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from yard import yard_depths
 
-from kgs.datasets.synthetic import synthetic_depths
 from kgs.fit import FitConfig, InitialPoints, view_dependence
 from kgs.fit.plan import make_plan, with_step_defaults
 from kgs.fit.run import choose_points, decide
@@ -107,11 +107,10 @@ def test_exposures_are_removed():
 # -- of a scene -----------------------------------------------------------------------------------------------------
 
 
-def with_harmonics(scene, kind, size):
+def with_harmonics(scene, depths, size):
     """The scene with harmonics on its surfaces, whose coefficients differ from place to place."""
     views = scene.train
     geometry = ViewGeometry.of(views.cameras)
-    depths = synthetic_depths(views.cameras, kind)[:, 0]
     images = views.images.clone()
     rng = generator()
     waves = 2.0 * torch.randn(3, 45, generator=rng, dtype=torch.float64)
@@ -145,7 +144,7 @@ def test_surfaces_of_one_colour_need_no_harmonics(arc):
 
 
 def test_surfaces_with_harmonics_need_them(arc):
-    plan = decided(with_harmonics(arc, "arc", 0.1))
+    plan = decided(with_harmonics(arc, yard_depths(arc.train), 0.1))
     assert plan.config == with_step_defaults(replace(OPEN, sh_degree=3), 6)
     assert plan.decisions.sh_degree.gain > MIN_GAIN
 

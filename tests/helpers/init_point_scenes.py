@@ -10,13 +10,11 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 
 from kgs.datasets.scene import Views
-from kgs.datasets.synthetic import synthetic_depths, synthetic_views
 from kgs.init_points.tracks import Tracks
 
 WIDTH, HEIGHT = 240, 180
 SMALL = (80, 60)
 CENTERS = np.array([[-0.4, 0.0, 0.0], [0.0, 0.15, 0.1], [0.4, -0.1, 0.0]])
-ABOVE = np.array([[-0.45, -1.7, -1.6], [0.0, -1.925, -1.6], [0.45, -1.7, -1.6]])  # m from the middle of the garden
 BACK, FRONT = (6.0, 0.3), (3.0, -0.2)  # planes z = depth + slope x
 BACK_TINT, FRONT_TINT = (1.0, 0.5, 0.25), (0.25, 0.5, 1.0)
 
@@ -32,12 +30,6 @@ def cameras(centers: np.ndarray = CENTERS, turn: float = -0.05, size: tuple[int,
         extrinsics[i, :3, :3] = torch.from_numpy(rotation)
         extrinsics[i, :3, 3] = torch.from_numpy(-rotation @ center)
     return PinholeCamera(intrinsics, extrinsics, torch.full((count,), height), torch.full((count,), width))
-
-
-def garden_from_above(size: tuple[int, int], seed: int = 0) -> tuple[Views, torch.Tensor]:
-    """Three views of the synthetic garden with texture everywhere, and their true depths `(3, H, W)`."""
-    views = synthetic_views(ABOVE, "orbit", size, seed)
-    return views, synthetic_depths(views.cameras, "orbit", seed)[:, 0]
 
 
 def focal_length(width: int) -> float:

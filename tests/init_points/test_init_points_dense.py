@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from init_point_scenes import garden_from_above
 from kornia.geometry.camera import PinholeCamera
+from yard import yard_depths, yard_from_above, yard_scene
 
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
@@ -24,19 +24,19 @@ from kgs.init_points.triangulate import TrackedPoints
 
 
 @pytest.fixture(scope="module")
-def garden() -> tuple[Views, torch.Tensor]:
-    return garden_from_above((72, 96))
+def yard() -> tuple[Views, torch.Tensor]:
+    return yard_from_above((72, 96))
 
 
 @pytest.fixture(scope="module")
-def views(garden: tuple[Views, torch.Tensor]) -> Views:
-    return garden[0]
+def views(yard: tuple[Views, torch.Tensor]) -> Views:
+    return yard[0]
 
 
 @pytest.fixture(scope="module")
 def large() -> tuple[Views, torch.Tensor]:
-    """The garden in as many pixels as the bounds of depth errors are for."""
-    return garden_from_above((96, 128))
+    """The yard in as many pixels as the bounds of depth errors are for."""
+    return yard_from_above((96, 128))
 
 
 def span_of(truth: torch.Tensor) -> tuple[float, float]:
@@ -44,8 +44,8 @@ def span_of(truth: torch.Tensor) -> tuple[float, float]:
 
 
 @pytest.fixture(scope="module")
-def span(garden: tuple[Views, torch.Tensor]) -> tuple[float, float]:
-    return span_of(garden[1])
+def span(yard: tuple[Views, torch.Tensor]) -> tuple[float, float]:
+    return span_of(yard[1])
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -250,7 +250,7 @@ def test_a_draw_of_more_than_there_is_takes_all(views: Views, span: tuple[float,
 @pytest.fixture(scope="module")
 def before_a_sky() -> tuple[Views, tuple[float, float]]:
     """Views with a sky, and the range of depths of what stands near."""
-    return synthetic_scene("arc", train_views=4, test_views=0, size=(72, 96)).train, (1.3, 6.0)
+    return yard_scene(4, 0).train, (1.3, 6.0)
 
 
 def test_points_of_the_sky_are_as_good_as_infinitely_far_away(before_a_sky) -> None:
@@ -258,7 +258,7 @@ def test_points_of_the_sky_are_as_good_as_infinitely_far_away(before_a_sky) -> N
     points, *_ = dense_points(sky, near, far, 2000, generator(), draw="spread")
     pixels, depths = project_points(points, sky.cameras)
     assert float(depths.max()) < 1.5 * FARTHEST * far  # in another camera a depth may be larger
-    truth = synthetic_depths(sky.cameras, "arc")[:, 0]
+    truth = yard_depths(sky)
     shares = []
     for view in range(len(sky)):
         x, y, inside = nearest_pixels(pixels[:, view], depths[:, view], 96, 72)

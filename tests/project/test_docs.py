@@ -111,7 +111,7 @@ def test_each_folder_of_results_says_what_made_it():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("folder", "packages"),
-    [("starts", ()), ("training", ("pandas", "distributed")), ("cameras", ("pandas", "distributed", "pycolmap"))],
+    [("starts", ()), ("training", ("pandas", "distributed"))],
 )
 def test_the_script_of_a_table_of_results_runs(folder, packages, tmp_path):
     for package in packages:

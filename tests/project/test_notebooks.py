@@ -106,12 +106,12 @@ CLAIMS = {
     ),
     "07_your_own_photos": (
         """
-        assert max(errors) < 1 and abs(report["focal_px"] / float(truth.cameras.intrinsics[0, 0, 0]) - 1) < 0.03
-        assert len(scene.test) == 0 and len(scene.train) == COUNT
-        assert fit.history["steps"] == judge.history["steps"] == STEPS and half.test.names == ("1.png",)
+        assert max(differences) < 1 and abs(report["focal_px"] / float(given.cameras.intrinsics[0, 0, 0]) - 1) < 0.03
+        assert len(scene.test) == 0 and len(scene.train) == len(NAMES)
+        assert fit.history["steps"] == judge.history["steps"] == STEPS and half.test.names
         """,
         """
-        assert max(errors) < 0.2 and fit.psnr(scene.train) > 28
+        assert max(differences) < 0.3 and fit.psnr(small.train) > 26
         assert 15 < judge.psnr(half.test) < judge.psnr(half.train)
         """,
     ),
@@ -226,13 +226,10 @@ def test_it_is_stored_small_as_run_from_top_to_bottom_and_one_cell_near_the_top_
 YOUR_OWN = nbformat.read(NOTEBOOKS[0].with_name("07_your_own_photos.ipynb"), as_version=4)
 
 
-def test_it_is_stored_without_photos_of_others():
-    """As it ran without KGS_DATA; the renders of these photos come with their attribution."""
-    (cell,) = [cell for cell in YOUR_OWN.cells if cell.cell_type == "code" and "BANANA" in cell.source]
-    assert [output.output_type for output in cell.outputs] == ["stream", "display_data"]
-    assert "would be shown here" in cell.outputs[0].text
-    (about,) = [cell.source for cell in YOUR_OWN.cells if cell.source.startswith("## Real photos")]
-    assert all("MIT licence" in text and "dataset_banana" in text for text in (cell.source, about))
+def test_its_photos_come_with_their_licence():
+    about = YOUR_OWN.cells[0].source
+    assert all(text in about for text in ("Piero Toffanin", "dataset_banana", "MIT licence"))
+    assert not [cell for cell in YOUR_OWN.cells if "KGS_DATA" in cell.source]
 
 
 @pytest.fixture

@@ -35,10 +35,10 @@ def camera() -> PinholeCamera:
     return kgs.pinhole_cameras(torch.eye(4, dtype=torch.float32), k, SIZE[1], SIZE[0], "half")
 
 
-def made_scene(kind: str = "room", new: bool = False) -> Scene:
+def made_scene(new: bool = False) -> Scene:
     if new:
-        synthetic._make_setup.cache_clear()
-    return synthetic.synthetic_scene(kind, train_views=3, test_views=1, size=(32, 40))
+        synthetic._make_world.cache_clear()
+    return synthetic.synthetic_scene(train_views=3, test_views=1, size=(32, 40))
 
 
 def points_of_a_file() -> object:
@@ -102,13 +102,12 @@ def test_the_default_dtype_changes_nothing(name, under):
     assert all(torch.equal(a, b) for a, b in zip(got, expected, strict=True))
 
 
-@pytest.mark.parametrize("kind", ["room", pytest.param("orbit", marks=pytest.mark.slow)])
-def test_a_scene_is_the_same_and_no_texture_keeps_the_default_dtype_it_was_made_under(kind, under):
+def test_a_scene_is_the_same_and_no_texture_keeps_the_default_dtype_it_was_made_under(under):
     under(torch.float64)
-    double = made_scene(kind, new=True)
+    double = made_scene(new=True)
     under(torch.float32)
-    cached = made_scene(kind)
-    expected = made_scene(kind, new=True)
+    cached = made_scene()
+    expected = made_scene(new=True)
     assert expected.train.images.dtype == torch.float32
     for scene in (double, cached):
         pairs = list(zip(tensors(scene), tensors(expected), strict=True))

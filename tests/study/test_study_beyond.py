@@ -10,10 +10,10 @@ from init_point_scenes import as_views
 
 from kgs.datasets import synthetic_scene
 from kgs.datasets.scene import Scene, pinholes
-from kgs.datasets.synthetic import ARC_CENTER, ARC_HEIGHT, ARC_RADIUS, ARC_SPAN, room, synthetic_depths, views_beyond
+from kgs.datasets.synthetic import room, synthetic_depths, views_beyond
 from kgs.geometry import camera_centers
 from kgs.study import beyond
-from kgs.study.beyond import Target, beyond_cells, from_the_middle, measure_target, synthetic_targets
+from kgs.study.beyond import Target, beyond_cells, from_the_middle, measure_target, room_targets
 from kgs.study.beyond_report import write_beyond
 from kgs.study.command import study
 
@@ -21,54 +21,30 @@ SIZE = (24, 32)
 
 
 @pytest.fixture(scope="module")
-def arc():
-    return synthetic_scene("arc", 6, 2, SIZE)
+def scene():
+    return synthetic_scene(3, 2, SIZE)
 
 
 @pytest.fixture(scope="module")
-def targets(arc):
-    return synthetic_targets("arc", arc)
+def targets(scene):
+    return room_targets(scene)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["room", "orbit"])
-def test_cameras_lie_so_many_times_as_far_from_their_middle(kind):
-    centers = [camera_centers(views_beyond(kind, out, 4, (6, 8)).cameras.extrinsics) for out in (1.0, 2.5)]
-    middle = torch.from_numpy(room.EYE).to(centers[0]) if kind == "room" else centers[0].mean(dim=0)
-    near, far = (each - middle for each in centers)
-    torch.testing.assert_close(far, 2.5 * near, atol=1e-4, rtol=1e-4)
-    if kind == "room":  # as far as the training cameras, or the outermost of them
-        torch.testing.assert_close((near[:, :2] / torch.tensor(room.PATCH[:2])).norm(dim=1), torch.ones(4).to(near))
+def test_cameras_before_the_room_lie_so_many_times_as_far_out():
+    for out in (1.0, 2.5):
+        centers = camera_centers(views_beyond(out, 4, (6, 8)).cameras.extrinsics).numpy()
+        flat = (centers - room.EYE)[:, :2] / room.PATCH[:2]
+        np.testing.assert_allclose(np.linalg.norm(flat, axis=1), out, rtol=1e-4)
+        np.testing.assert_allclose(centers[:, 2], room.EYE[2], atol=1e-5)
 
 
 @pytest.mark.slow
-def test_cameras_of_the_arc_stay_at_their_distance_and_look_at_its_middle():
-    cameras = views_beyond("arc", 3.0, 5, (6, 8)).cameras
-    away = camera_centers(cameras.extrinsics).double().numpy() - ARC_CENTER
-    np.testing.assert_allclose(np.hypot(away[:, 0], away[:, 2]), ARC_RADIUS, rtol=1e-5)
-    angles = np.arctan2(away[:, 0], -away[:, 2])
-    np.testing.assert_allclose(np.hypot(angles / ARC_SPAN, away[:, 1] / ARC_HEIGHT), 3.0, rtol=1e-4)
-    axes = cameras.extrinsics[:, 2, :3].double().numpy()
-    np.testing.assert_allclose(axes, -away / np.linalg.norm(away, axis=1, keepdims=True), atol=1e-5)
-
-
-@pytest.mark.slow
-def test_the_sky_of_the_arc_is_as_good_as_infinitely_far_away(arc):
-    depths = synthetic_depths(arc.train.cameras, "arc")
-    assert (depths > 1).all()  # a camera sees ground or sky everywhere
-    sky = depths > 100
-    assert 0.3 < sky.double().mean() < 0.7
-    assert arc.train.images.amax() <= 1
-    blue = arc.train.images[:, 2:][sky].mean() - arc.train.images[:, :1][sky].mean()
-    assert blue > 0.05
-
-
-@pytest.mark.slow
-def test_all_that_a_training_view_sees_counts_in_it(arc):
-    depths = synthetic_depths(arc.train.cameras, "arc")[:, 0]
-    count = beyond.views_that_show(depths[2], arc.train.camera(2), list(depths), arc.train.cameras)
+def test_all_that_a_training_view_sees_counts_in_it(scene):
+    depths = synthetic_depths(scene.train.cameras)[:, 0]
+    count = beyond.views_that_show(depths[2], scene.train.camera(2), list(depths), scene.train.cameras)
     assert count.min() >= 1
-    assert count.max() == 6
+    assert count.max() == 3
 
 
 @pytest.mark.slow
@@ -135,14 +111,14 @@ def test_a_border_is_that_of_the_photos_in_the_middle():
 
 def test_cells_are_there_once_the_synthetic_ones_first(tmp_path):
     alone = beyond_cells(None)
-    assert {cell["scene"] for cell in alone} == {*beyond.WORLDS}
+    assert {cell["scene"] for cell in alone} == {beyond.ROOM}
     for scene in beyond.PHOTOS:
         (tmp_path / scene).mkdir(parents=True)
     cells = beyond_cells(tmp_path)
     assert cells[: len(alone)] == alone
-    assert {cell["scene"] for cell in cells} == {*beyond.WORLDS, *beyond.PHOTOS}
-    assert len({json.dumps(cell, sort_keys=True) for cell in cells}) == len(cells) == 15
-    assert [cell["seed"] for cell in alone] == [0, 0, 1, 1, 2, 2]
+    assert {cell["scene"] for cell in cells} == {beyond.ROOM, *beyond.PHOTOS}
+    assert len({json.dumps(cell, sort_keys=True) for cell in cells}) == len(cells) == 12
+    assert [cell["seed"] for cell in alone] == [0, 1, 2]
 
 
 @pytest.mark.slow
@@ -155,7 +131,7 @@ def test_a_run_keeps_its_cells_and_reports(tmp_path, monkeypatch, threads):
     assert study(out=tmp_path, preset="beyond", scheduler=threads) == 0
     beyond._scene.cache_clear()
     rows = [json.loads(line) for line in (tmp_path / "beyond.jsonl").read_text().splitlines()]
-    assert sorted(row["cell"]["scene"] for row in rows) == ["arc", "room"]
+    assert [row["cell"]["scene"] for row in rows] == ["room"] * 2
     for row in rows:
         assert set(row["result"]["beyond"]) == {"1", "2", "3"}
         assert row["result"]["beyond"]["2"]["psnr"] > 5
@@ -172,7 +148,7 @@ def test_the_report_has_a_line_for_each_scene_with_its_seeds(tmp_path):
     common = {"test": whole, "train": whole, "gaussians": 9, "wall_seconds": 2.0, "revision": "abc"}
     far = {"share": 0.5, "psnr": 20.0, "lpips": None}
     rows = [
-        {"cell": beyond._cell("arc", 6, seed), "result": common | {"beyond": {str(k): far for k in beyond.OUT}}}
+        {"cell": beyond._cell("room", 3, seed), "result": common | {"beyond": {str(k): far for k in beyond.OUT}}}
         for seed in range(2)
     ]
     seen = {"seen": {"psnr": 22.0, "share": 0.7}, "beyond": {}}
@@ -180,5 +156,5 @@ def test_the_report_has_a_line_for_each_scene_with_its_seeds(tmp_path):
     text = write_beyond(rows, tmp_path / "new", "COMMAND", 15)
     assert (tmp_path / "new" / "beyond.md").read_text(encoding="utf-8") == text.rstrip() + "\n"
     assert "3 of 15 cells; by commit of kgs: 3 abc" in text
-    assert "| arc, 6 views | auto | 2 | 25.00 (0.00); 0.100 (0.000) | 20.00 (0.00) |" in text
+    assert "| room, 3 views | auto | 2 | 25.00 (0.00); 0.100 (0.000) | 20.00 (0.00) |" in text
     assert "| llff/fern, 3 views | auto | 1 | 25.00; 0.100 | 22.00 | 0.70 |" in text

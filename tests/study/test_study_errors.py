@@ -54,7 +54,7 @@ CASES = [
     ("llff/fern", DataError, lambda _: sparse_cell(tiny_cell() | {"scene": "llff/fern"})),
     ("llff/fern", DataError, lambda _: beyond_cell(tiny_cell() | {"scene": "llff/fern"})),
     *[
-        ("out, count", ValueError, lambda _, out=out, count=count: views_beyond("room", out, count, (6, 8)))
+        ("out, count", ValueError, lambda _, out=out, count=count: views_beyond(out, count, (6, 8)))
         for out, count in ((0.0, 6), (float("nan"), 6), (1.0, 0))
     ],
     *[("steps", ValueError, lambda _, steps=steps: with_steps([tiny_cell()], steps)) for steps in (0, -1)],

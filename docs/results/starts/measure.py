@@ -22,8 +22,7 @@ from kgs.init_points import initial_points
 ALL_POINTS, RANDOM_POINTS = 10**6, 10_000
 QUICK, SMALL, LARGE = (126, 168), (189, 252), (378, 504)  # height, width
 SEEDS, FEW = 3, 8  # more views than these are measured with one seed
-SYNTHETIC = [("room", views, SMALL) for views in (3, 6, 12, 24)] + [("orbit", views, SMALL) for views in (8, 12)]
-SYNTHETIC += [("room", views, LARGE) for views in (3, 12, 24)]
+ROOM = [(views, SMALL) for views in (3, 6, 12, 24)] + [(views, LARGE) for views in (3, 12, 24)]
 REAL = [("llff/fern", 3), ("llff/flower", 3), ("colmap/trex", 3), ("blender/lego", 8), ("nerfstudio/fox", 12)]
 REAL += [("llff/flower", views) for views in (6, 9, 24)]
 NEAR, CLOSE = 0.01, 0.02  # relative depth errors that are counted
@@ -56,11 +55,11 @@ def starts(*, out: Path, quick: bool = False) -> None:
         print("the synthetic scene alone" + ("" if quick else ": KGS_DATA is not set"))
     out.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
-    for kind, count, size in [("room", 3, QUICK)] if quick else SYNTHETIC:
+    for count, size in [(3, QUICK)] if quick else ROOM:
         for seed in range(1 if quick or count > FEW or size == LARGE else SEEDS):
-            print(f"{kind}, {count} views of {size[1]}x{size[0]}, seed {seed} ...")
-            views = synthetic_scene(kind, count, 0, size, seed).train
-            rows += _rows(kind, views, seed, synthetic_depths(views.cameras, kind, seed)[:, 0])
+            print(f"room, {count} views of {size[1]}x{size[0]}, seed {seed} ...")
+            views = synthetic_scene(count, 0, size, seed).train
+            rows += _rows("room", views, seed, synthetic_depths(views.cameras, seed)[:, 0])
     for name, count in REAL if data is not None else ():
         print(f"{name}, {count} views ...")
         rows += _rows(name, load_scene(Path(data or "") / name, count).train)

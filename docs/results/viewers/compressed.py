@@ -17,7 +17,7 @@ out, back = map(Path, sys.argv[1:])
 if (out / "config.json").exists():
     fit = load_fit(out)[1]
 else:
-    scene = synthetic_scene("room", train_views=3, test_views=3, size=(378, 504), seed=0)
+    scene = synthetic_scene(train_views=3, test_views=3, size=(378, 504), seed=0)
     fit = Fit(scene, kgs.load_ply(out / "splat.ply"), kgs.RasterOptions())
 plain = replace(fit, model=kgs.load_ply(out / "splat.ply", origin=fit.scene.offset))
 rounded = replace(fit, model=kgs.load_ply(back, origin=fit.scene.offset))
