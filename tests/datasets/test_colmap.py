@@ -120,15 +120,6 @@ def test_a_model_beside_its_photos_or_their_folder(tmp_path: Path, text: bool, b
     assert torch.equal(before.points, after.points)
 
 
-def test_a_model_without_photos_is_no_scene(tmp_path: Path) -> None:
-    write_colmap(tmp_path, text=True)
-    for path in (tmp_path / "sparse" / "0").iterdir():
-        path.rename(tmp_path / path.name)
-    (tmp_path / "images").rename(tmp_path / "photos")
-    with pytest.raises(DataError, match="the COLMAP model is not used: expected its photos beside it or in images/"):
-        load_scene(tmp_path)
-
-
 def test_photos_that_are_gone_are_left_out_and_named(tmp_path: Path) -> None:
     write_colmap(tmp_path)
     cv2.imwrite(str(tmp_path / "images" / "aaa.png"), np.zeros((5, 5, 3), np.uint8))  # one that the model lacks
@@ -165,19 +156,3 @@ def test_a_model_without_photos_is_named(tmp_path: Path, hold_out: int | None) -
     (tmp_path / "sparse" / "0" / "images.txt").write_text("# none\n")
     with pytest.raises(DataError, match=f"{tmp_path.name}: expected .*posed images"):
         load_scene(tmp_path, hold_out=hold_out)
-
-
-@pytest.mark.parametrize("text", [False, True])
-def test_points_without_tracks_are_told_from_no_points(tmp_path: Path, text: bool) -> None:
-    """LiDAR's: nothing says which photos see them."""
-    pycolmap = pytest.importorskip("pycolmap")
-    write_colmap(tmp_path, text=text)
-    model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
-    for point_id in list(model.points3D):
-        model.delete_point3D(point_id)
-    assert len(load_scene(tmp_path).points) == 0
-    for i in range(5):
-        model.add_point3D(np.full(3, float(i)), pycolmap.Track(), np.zeros(3, np.uint8))
-    (model.write_text if text else model.write_binary)(str(tmp_path / "sparse" / "0"))
-    with pytest.raises(DataError, match="points with a track.*got 5 without"):
-        load_scene(tmp_path, points="model-points")

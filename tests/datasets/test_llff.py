@@ -21,20 +21,14 @@ def rows() -> np.ndarray:
     return llff_rows(poses())
 
 
-def test_offset_is_the_mean_of_the_training_centres_and_nothing_else(tmp_path: Path) -> None:
+def test_offset_is_the_mean_of_the_training_centres(tmp_path: Path) -> None:
     array = rows()
-    write_rows(tmp_path / "a", array)
-    before = load_scene(tmp_path / "a", 3)
-    np.testing.assert_allclose(before.offset, array[[1, 5, 9]][:, [3, 8, 13]].mean(axis=0), rtol=1e-14)
-    rotation, translation = before.train.cameras.extrinsics.split((3, 1), dim=2)
+    write_rows(tmp_path, array)
+    scene = load_scene(tmp_path, 3)
+    np.testing.assert_allclose(scene.offset, array[[1, 5, 9]][:, [3, 8, 13]].mean(axis=0), rtol=1e-14)
+    rotation, translation = scene.train.cameras.extrinsics.split((3, 1), dim=2)
     centers = -(rotation[:, :3].mT @ translation[:, :3])
     np.testing.assert_allclose(centers.mean(dim=0), np.zeros((3, 1)), atol=1e-6)
-    others = [0, 2, 3, 4, 6, 7, 8]
-    array[others] = llff_rows(poses(seed=1))[others]
-    write_rows(tmp_path / "b", array)
-    after = load_scene(tmp_path / "b", 3)
-    assert torch.equal(before.offset, after.offset)
-    assert torch.equal(before.train.cameras.extrinsics, after.train.cameras.extrinsics)
 
 
 def test_far_from_the_origin_no_digit_is_lost(tmp_path: Path) -> None:

@@ -31,6 +31,10 @@ IN_ORDER = [
     (["sparse/images.txt", "transforms.json"], "cameras.bin or cameras.txt"),
     (["transforms_train.json", "transforms.json"], r"transforms_train\.json"),
     (["transforms.json"], r"transforms\.json"),
+    (
+        ["images.txt", "cameras.txt", "photos/0.jpg"],
+        "COLMAP model is not used: expected its photos beside it or in images/",
+    ),
     *[([*PHOTOS, other], f"{other} is not used") for other in ("reconstruction.json", "transform_train.json")],
 ]
 OTHER_PROGRAMS = [
