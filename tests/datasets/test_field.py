@@ -1,34 +1,22 @@
 """Standard downloads in the size of published tables."""
 
-import json
-
 import cv2
 import numpy as np
 import pytest
-import tiny_scenes
 import torch
+from tiny_scenes import write_blender, write_llff, write_llff_rows, write_photos
 
 from kgs import DataError
 from kgs.datasets import load_scene
 from kgs.datasets.field import field_size
 
-FULL = (1512, 2016)  # height and width that the cameras are for
-
-
-def write_photos(folder, height, width):
-    folder.mkdir(parents=True)
-    rng = np.random.default_rng(height)
-    for i in range(3):
-        cv2.imwrite(str(folder / f"{i}.png"), rng.integers(0, 255, (height, width, 3), np.uint8))
+FULL = (2016, 1512)  # the width and height that the cameras are for
 
 
 @pytest.fixture
 def download(tmp_path):
     """Cameras of LLFF for large photos; the test adds folders of photos."""
-    row = np.array([0, 1, 0, 0, FULL[0], 1, 0, 0, 0, FULL[1], 0, 0, -1, 0, 1700, 1, 9], dtype=float)
-    rows = np.tile(row, (3, 1))
-    rows[:, 3] = (0, 0.5, 1)
-    np.save(tmp_path / "poses_bounds.npy", rows)
+    write_llff_rows(tmp_path, 3, FULL, focal=1700.0)
     return tmp_path
 
 
@@ -39,9 +27,9 @@ def loaded(root, **options):
 
 
 def test_the_eighth_of_a_download_is_taken_where_it_is(download):
-    write_photos(download / "images", 378, 504)
-    write_photos(download / "images_4", 378, 504)
-    write_photos(download / "images_8", 189, 252)
+    write_photos(download / "images", size=(504, 378))
+    write_photos(download / "images_4", size=(504, 378))
+    write_photos(download / "images_8", size=(252, 189))
     views = loaded(download)
     assert views.images.shape[-2:] == (189, 252)
     photo = cv2.imread(str(download / "images_8" / "0.png"))[..., ::-1] / 255.0
@@ -50,8 +38,8 @@ def test_the_eighth_of_a_download_is_taken_where_it_is(download):
 
 
 def test_a_folder_that_is_named_is_taken(download):
-    write_photos(download / "images", 378, 504)
-    write_photos(download / "images_8", 189, 252)
+    write_photos(download / "images", size=(504, 378))
+    write_photos(download / "images_8", size=(252, 189))
     assert load_scene(download, hold_out=0, photo_folder="images_8").train.images.shape[-2:] == (189, 252)
     assert load_scene(download, hold_out=0).train.images.shape[-2:] == (378, 504)
     with pytest.raises(DataError, match="images_4/"):
@@ -59,7 +47,7 @@ def test_a_folder_that_is_named_is_taken(download):
 
 
 def test_larger_photos_are_reduced_and_the_sentence_says_so(download):
-    write_photos(download / "images", 378, 504)
+    write_photos(download / "images", size=(504, 378))
     assert field_size(download)[:2] == ("", 2.0)
     assert "504x378 reduced to 252x189" in field_size(download)[2]
     views = loaded(download)
@@ -70,20 +58,18 @@ def test_larger_photos_are_reduced_and_the_sentence_says_so(download):
 
 
 def test_photos_of_that_size_stay_as_they_are(download):
-    write_photos(download / "images", 189, 252)
+    write_photos(download / "images", size=(252, 189))
     assert field_size(download)[:2] == ("", None)
 
 
 def test_scenes_of_small_photos_stay_as_they_are(tmp_path):
-    tiny_scenes.write_llff(tmp_path)
+    write_llff(tmp_path)
     assert field_size(tmp_path)[:2] == ("", None)
 
 
 def test_images_of_blender_are_halved(tmp_path):
-    write_photos(tmp_path / "train", 800, 800)
-    frames = [{"file_path": f"./train/{i}", "transform_matrix": np.eye(4).tolist()} for i in range(3)]
-    for split in ("train", "test"):
-        (tmp_path / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
+    write_blender(tmp_path)
+    write_photos(tmp_path / "train", size=(800, 800))
     assert field_size(tmp_path)[:2] == ("", 2.0)
     with pytest.raises(DataError, match="images_8"):
         load_scene(tmp_path, photo_folder="images_8")

@@ -54,7 +54,7 @@ def test_alpha_grey_and_16_bit(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_image(tmp_path / "deep.png"), np.full((2, 3, 3), 0.2), rtol=1e-6)
 
 
-@pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp"])
+@pytest.mark.parametrize("suffix", [".png", ".webp"])
 @pytest.mark.parametrize("kept", [0.0, 0.5, 0.98])
 def test_a_truncated_image_is_named(tmp_path: Path, suffix: str, kept: float) -> None:
     noise = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)
@@ -66,12 +66,10 @@ def test_a_truncated_image_is_named(tmp_path: Path, suffix: str, kept: float) ->
         read_image(path)
 
 
-def test_float_images_and_missing_files_are_refused(tmp_path: Path) -> None:
+def test_float_images_are_refused(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.tif"), np.zeros((2, 2), np.float32))
     with pytest.raises(DataError, match="8 or 16 bit"):
         read_image(tmp_path / "a.tif")
-    with pytest.raises(DataError, match=r"nowhere\.png"):
-        read_image(tmp_path / "nowhere.png")
 
 
 def test_folders(tmp_path: Path) -> None:

@@ -10,21 +10,10 @@ import numpy as np
 import pytest
 import torch
 from epipolar import sampson_distances
-from tiny_scenes import write_blender, write_colmap, write_nerfstudio
+from tiny_scenes import write_blender, write_colmap, write_llff, write_nerfstudio
 
 from kgs._support.errors import DataError
 from kgs.datasets import load_scene
-
-# an LLFF row for 6x4 images: axes down, right, backward, the centre, (height, width, focal), then two depths
-UPRIGHT = np.array([0, 1, 0, 0, 4, 1, 0, 0, 0, 6, 0, 0, -1, 0, 5, 1, 9], dtype=float)
-
-
-def posed_photos(root: Path, count: int = 3) -> None:
-    (root / "images").mkdir()
-    for i in range(count):
-        cv2.imwrite(str(root / "images" / f"{i}.jpg"), np.zeros((4, 6, 3), np.uint8))
-    np.save(root / "poses_bounds.npy", np.tile(UPRIGHT, (count, 1)))
-
 
 PHOTOS = ["0.jpg", "1.jpg", "2.jpg"]
 WITHOUT_POSES = [
@@ -42,6 +31,10 @@ IN_ORDER = [
     (["sparse/images.txt", "transforms.json"], "cameras.bin or cameras.txt"),
     (["transforms_train.json", "transforms.json"], r"transforms_train\.json"),
     (["transforms.json"], r"transforms\.json"),
+    (
+        ["images.txt", "cameras.txt", "photos/0.jpg"],
+        "COLMAP model is not used: expected its photos beside it or in images/",
+    ),
     *[([*PHOTOS, other], f"{other} is not used") for other in ("reconstruction.json", "transform_train.json")],
 ]
 OTHER_PROGRAMS = [
@@ -135,10 +128,10 @@ def test_a_folder_too_deep_or_too_high_is_told_where_the_scene_is(tmp_path: Path
 
 
 def test_photos_of_several_sizes_are_told_in_their_own_pixels(tmp_path: Path) -> None:
-    posed_photos(tmp_path)
-    cv2.imwrite(str(tmp_path / "images" / "2.jpg"), np.zeros((8, 12, 3), np.uint8))
+    write_llff(tmp_path, size=(6, 4))
+    cv2.imwrite(str(tmp_path / "images" / "2.png"), np.zeros((8, 12, 3), np.uint8))
     for downscale in (None, 2):
-        with pytest.raises(DataError, match=r"2\.jpg: expected 6x4 pixels as the other images, got 12x8"):
+        with pytest.raises(DataError, match=r"2\.png: expected 6x4 pixels as the other images, got 12x8"):
             load_scene(tmp_path, downscale=downscale)
 
 
@@ -161,21 +154,21 @@ def test_what_is_there_and_not_used_is_named(tmp_path: Path, file: str) -> None:
     ],
 )
 def test_wrong_arguments_are_named(tmp_path: Path, arguments: dict[str, object], name: str) -> None:
-    posed_photos(tmp_path, 11)
+    write_llff(tmp_path, 11)
     with pytest.raises(ValueError, match=f"^{name}"):
         load_scene(tmp_path, **arguments)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_a_scene_needs_a_view_to_train_on_and_one_to_test_on(tmp_path: Path, count: int) -> None:
-    posed_photos(tmp_path, count)
+    write_llff(tmp_path, count)
     with pytest.raises(DataError, match=f"at least 2 posed images.*got {count}"):
         load_scene(tmp_path)
 
 
 @pytest.mark.parametrize(("downscale", "size"), [(2, (2, 3)), (1.5, (3, 4)), (100, (1, 1)), (1, (4, 6))])
 def test_sizes_are_rounded_and_never_empty(tmp_path: Path, downscale: float, size: tuple[int, int]) -> None:
-    posed_photos(tmp_path)
+    write_llff(tmp_path, size=(6, 4))
     scene = load_scene(tmp_path, downscale=downscale)
     assert tuple(scene.train.images.shape[-2:]) == tuple(scene.test.images.shape[-2:]) == size
     assert float(scene.train.cameras.cx[0]) == pytest.approx((size[1] - 1) / 2, abs=1e-6)
@@ -188,7 +181,7 @@ def test_first_points_have_the_training_views_in_more_pixels(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, downscale: float | None, fine_pixels: int, finer: tuple | None
 ) -> None:
     monkeypatch.setattr("kgs.datasets.load._FINE_PIXELS", fine_pixels)
-    posed_photos(tmp_path)
+    write_llff(tmp_path, size=(6, 4))
     scene = load_scene(tmp_path, downscale=downscale)
     assert (scene.train_full_size and tuple(scene.train_full_size.images.shape[-2:])) == finer
     if scene.train_full_size is not None:

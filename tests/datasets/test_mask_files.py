@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from kgs._support.errors import DataError
 from kgs.datasets.mask_files import find_mask_files
 
 CAMERAS = ("images/cam0/0.jpg", "images/cam1/0.jpg")
@@ -58,10 +57,3 @@ def test_a_folder_that_is_named_is_the_only_one(tmp_path: Path) -> None:
     files = find_mask_files(paths, tmp_path, tmp_path / "mine")
     assert files.keeping == {paths[0]: mask}
     assert files.unused == [other]
-
-
-def test_a_mask_of_two_photos_is_refused(tmp_path: Path) -> None:
-    paths = write(tmp_path, *CAMERAS)
-    write(tmp_path, "images/masks/0.png")
-    with pytest.raises(DataError, match="expected a mask of one photo"):
-        find_mask_files(paths, tmp_path)

@@ -1,6 +1,5 @@
 """Upright and lying photos in one scene: the rarer kind is turned, with its camera, and shown as it was taken."""
 
-import json
 from pathlib import Path
 
 import cv2
@@ -9,6 +8,7 @@ import pytest
 import torch
 from init_point_scenes import painted_planes
 from kornia.geometry.camera import PinholeCamera
+from tiny_scenes import write_transforms
 
 from kgs import GaussianModel, GaussianRenderer
 from kgs.app.cli.page import in_frame_of
@@ -25,12 +25,12 @@ def write(root: Path, turned: tuple[int, ...], mask: int | None = None) -> Path:
     """The painted planes as nerfstudio has them; photos in `turned` as an upright camera would have taken them."""
     views = painted_planes()
     (root / "images").mkdir(parents=True)
-    frames = []
+    frames = {}
     for i, name in enumerate(NAMES):
         image = (views.images[i].permute(1, 2, 0).numpy()[..., ::-1] * 255).round().astype(np.uint8)
         height, width = image.shape[:2]
-        lens = views.cameras.intrinsics[i].double().numpy()
-        fx, fy, cx, cy = lens[0, 0], lens[1, 1] * 1.1, lens[0, 2] + 3.5, lens[1, 2] - 1.5
+        matrix = views.cameras.intrinsics[i].double().numpy()
+        fx, fy, cx, cy = matrix[0, 0], matrix[1, 1] * 1.1, matrix[0, 2] + 3.5, matrix[1, 2] - 1.5
         pose = np.linalg.inv(views.cameras.extrinsics[i].double().numpy())
         kept = np.full((height, width), 255, np.uint8)
         kept[: height // 3] = 0
@@ -40,12 +40,12 @@ def write(root: Path, turned: tuple[int, ...], mask: int | None = None) -> Path:
             height, width = width, height
             pose = pose @ BACK
         cv2.imwrite(str(root / "images" / name), image)
-        frame = {"file_path": f"images/{name}", "transform_matrix": (pose @ OPENGL).tolist(), "w": width, "h": height}
-        frames.append(frame | {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy})
+        lens = {"w": width, "h": height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
+        frames[f"images/{name}"] = {"transform_matrix": (pose @ OPENGL).tolist(), **lens}
         if i == mask:
             (root / "masks").mkdir()
             cv2.imwrite(str(root / "masks" / name), kept)
-    (root / "transforms.json").write_text(json.dumps({"frames": frames}))
+    write_transforms(root / "transforms.json", {}, frames)
     return root
 
 

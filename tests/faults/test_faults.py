@@ -25,13 +25,13 @@ from kgs.app.files.publishing import UNFINISHED, is_own
 from kgs.app.files.results_folder import CHECKPOINT
 from kgs.fit.checkpoint import load_checkpoint, newest_checkpoint
 
-SHORT, LONG = 24, 450  # steps
+STEPS = 450
 
 
-@pytest.fixture(scope="module", params=[SHORT, pytest.param(LONG, marks=pytest.mark.slow)])
-def alone(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[int, bytes]:
-    """Steps of a fit that is left alone, and what its splat.ply holds."""
-    return request.param, Fit(tmp_path_factory.mktemp("alone"), "alone", request.param).finish()
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """What splat.ply of a fit holds that is left alone."""
+    return Fit(tmp_path_factory.mktemp("alone"), "alone", STEPS).finish()
 
 
 @pytest.fixture
@@ -52,11 +52,10 @@ def _bits(same: bool) -> str:
 
 
 @pytest.mark.slow  # test_study_grid.py kills a grid, test_run.py damages checkpoints
-def test_kill_9_at_random_moments(alone: tuple[int, bytes], tmp_path: Path, record: Callable[..., None]) -> None:
+def test_kill_9_at_random_moments(alone: bytes, tmp_path: Path, record: Callable[..., None]) -> None:
     """One fit after the other, killed again and again, each time resumed from what it left."""
-    steps, expected = alone
-    trials, longest = (30, 0.6) if steps == LONG else (1, 0.1)
-    fit, moments = Fit(tmp_path, "killed", steps), random.Random(0)
+    trials, longest = 30, 0.6
+    fit, moments = Fit(tmp_path, "killed", STEPS), random.Random(0)
     path, corrupt, fallen_back, different, fits, kills = fit.out / UNFINISHED / CHECKPOINT, 0, 0, 0, 0, 0
     while kills < trials:
         process = fit.start()
@@ -67,7 +66,7 @@ def test_kill_9_at_random_moments(alone: tuple[int, bytes], tmp_path: Path, reco
         kills += process.exitcode == -signal.SIGKILL and path.exists()
         longest = 0.7 * longest if process.exitcode == 0 else longest  # this machine is faster
         if process.exitcode == 0:  # it was done before
-            different += (fit.out / "splat.ply").read_bytes() != expected
+            different += (fit.out / "splat.ply").read_bytes() != alone
             fits += 1
             shutil.rmtree(fit.out)
             continue
@@ -81,7 +80,7 @@ def test_kill_9_at_random_moments(alone: tuple[int, bytes], tmp_path: Path, reco
             newest_checkpoint(path)
         except DataError:
             corrupt += 1
-    different += fit.finish() != expected
+    different += fit.finish() != alone
     found = f"{fallen_back} times the previous checkpoint, {fits + 1} fits ended, {different} of them in other bits"
     record("kill -9 at a random moment", trials, corrupt, found, corrupt == different == 0)
 
@@ -149,22 +148,22 @@ def test_kill_9_of_each_command(
 
 
 @pytest.mark.slow  # test_run.py has the signals in one process
-def test_sigterm(alone: tuple[int, bytes], tmp_path: Path, record: Callable[..., None]) -> None:
-    fit = Fit(tmp_path, "terminated", alone[0])
+def test_sigterm(alone: bytes, tmp_path: Path, record: Callable[..., None]) -> None:
+    fit = Fit(tmp_path, "terminated", STEPS)
     process = fit.start()
     running = fit.wait_for_steps(process)
     process.terminate()
     process.join(PATIENCE)
     code, written = process.exitcode, (fit.out / "metrics.json").exists()
-    same = fit.finish() == alone[1]
+    same = fit.finish() == alone
     found = f"exit code {code}, results {'' if written else 'not '}written; resumed: {_bits(same)}"
     record("SIGTERM", 1, int(not same), found, running and written and same and code == 128 + signal.SIGTERM)
 
 
 @pytest.mark.slow
-def test_full_disk(alone: tuple[int, bytes], tmp_path: Path, record: Callable[..., None]) -> None:
+def test_full_disk(alone: bytes, tmp_path: Path, record: Callable[..., None]) -> None:
     """From some step on no file may grow beyond 16 KiB: neither checkpoints nor results can be written."""
-    fit = Fit(tmp_path, "full", alone[0])
+    fit = Fit(tmp_path, "full", STEPS)
     process = fit.start(limit=2**14)
     process.join(PATIENCE)
     code = process.exitcode
@@ -173,7 +172,7 @@ def test_full_disk(alone: tuple[int, bytes], tmp_path: Path, record: Callable[..
     except DataError:
         step = -1
     partial = [path.name for path in fit.out.rglob("*.partial")]
-    same = fit.finish() == alone[1]
+    same = fit.finish() == alone
     found = f"the checkpoint of step {step} is whole, {len(partial)} partial files; resumed: {_bits(same)}"
     record("full disk", 1, int(step < 0), found, code != 0 and step > 0 and not partial and same)
 

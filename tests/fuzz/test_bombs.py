@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from cost import read_within_bounds
 from damage import GEOMETRIC_KEYS
-from tiny_scenes import plain_png, write_blender, write_image, write_nerfstudio
+from tiny_scenes import plain_png, update_json, write_blender, write_image, write_nerfstudio
 
 from kgs._support.errors import DataError
 from kgs.datasets import Views, load_scene
@@ -84,9 +84,7 @@ def test_a_key_is_used_refused_or_noted(
             path.write_text(json.dumps({**kept, "camera_angle_x": 0.9}))
     plain = load_scene(tmp_path)
     for path in tmp_path.glob("transforms*.json"):
-        content = json.loads(path.read_text())
-        (content["frames"][0] if in_a_frame else content)[key] = GEOMETRIC_KEYS[key]
-        path.write_text(json.dumps(content))
+        update_json(path, 0 if in_a_frame else None, **{key: GEOMETRIC_KEYS[key]})
     try:
         scene = load_scene(tmp_path)
     except DataError:

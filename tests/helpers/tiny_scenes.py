@@ -9,6 +9,7 @@ import json
 import math
 import struct
 import zlib
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from kgs.metrics.lpips import Lpips
 from kgs.model import GaussianModel
 from kgs.ply import save_ply
 
+Object = dict[str, Any]
 _SIZE = (16, 12)
 _NAMES = ("0.png", "1.png", "2.png")
 _TURN = (0.998, 0.02, -0.05, 0.03)  # of the second photo, w x y z, not of unit length
@@ -32,18 +34,26 @@ _OPENCV = (14.0, 14.5, 8.2, 6.1, -0.05, 0.01, 0.001, -0.001)
 _RADIAL = (14.0, 8.0, 6.0, -0.02)
 
 
-def write_photos(folder: Path, channels: int = 3) -> None:
+def write_photos(folder: Path, channels: int = 3, count: int = 3, size: tuple[int, int] = _SIZE) -> None:
+    """Noise; `size` is (width, height)."""
     folder.mkdir(parents=True, exist_ok=True)
-    noise = np.random.default_rng(0).integers(0, 255, (len(_NAMES), *_SIZE[::-1], channels), np.uint8)
-    for name, image in zip(_NAMES, noise, strict=True):
-        cv2.imwrite(str(folder / name), image)
+    noise = np.random.default_rng(0).integers(0, 255, (count, *size[::-1], channels), np.uint8)
+    for i, image in enumerate(noise):
+        cv2.imwrite(str(folder / f"{i}.png"), image)
 
 
-def write_llff(root: Path) -> None:
-    rows = np.tile(np.array([0, 1, 0, 0, 12, 1, 0, 0, 0, 16, 0, 0, -1, 0, 14, 1, 9], dtype=float), (3, 1))
-    rows[:, 3] = (0, 0.5, 1)
+def write_llff(root: Path, count: int = 3, size: tuple[int, int] = _SIZE, folder: str = "images") -> None:
+    write_llff_rows(root, count, size)
+    write_photos(root / folder, count=count, size=size)
+
+
+def write_llff_rows(root: Path, count: int, size: tuple[int, int], focal: float = 14.0) -> None:
+    """Axes down, right and backward, the centre, (height, width, focal length), then two depths."""
+    width, height = size
+    row = np.array([0, 1, 0, 0, height, 1, 0, 0, 0, width, 0, 0, -1, 0, focal, 1, 9], dtype=float)
+    rows = np.tile(row, (count, 1))
+    rows[:, 3] = np.linspace(0, 1, count)
     np.save(root / "poses_bounds.npy", rows)
-    write_photos(root / "images")
 
 
 def write_colmap(root: Path, text: bool = False, rig: bool = False) -> None:
@@ -104,20 +114,35 @@ def _matrix(i: int) -> list[list[float]]:
     return [[c, 0.0, s, 0.5 * i], [0.0, 1.0, 0.0, 0.0], [-s, 0.0, c, 4.0], [0.0, 0.0, 0.0, 1.0]]
 
 
-def write_blender(root: Path) -> None:
-    for split in ("train", "test"):
-        write_photos(root / split, channels=4)
-        frames = [{"file_path": f"./{split}/{i}", "transform_matrix": _matrix(i)} for i in range(3)]
-        (root / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
+def write_transforms(path: Path, top: Object, frames: Mapping[str, Object]) -> Path:
+    """Such a file: what all frames have, and by the name of its photo what a frame has itself."""
+    entries = [
+        {"file_path": name, "transform_matrix": _matrix(i), **own} for i, (name, own) in enumerate(frames.items())
+    ]
+    path.write_text(json.dumps({**top, "frames": entries}))
+    return path
+
+
+def update_json(path: Path, frame: int | None = None, **values: Any) -> None:
+    """Sets keys of an object in a file, or of one of its `frames`."""
+    content = json.loads(path.read_text())
+    (content if frame is None else content["frames"][frame]).update(values)
+    path.write_text(json.dumps(content))
+
+
+def write_blender(root: Path, train: int = 3, test: int = 3) -> None:
+    for split, count in (("train", train), ("test", test)):
+        write_photos(root / split, channels=4, count=count)
+        frames: dict[str, Object] = {f"./{split}/{i}": {} for i in range(count)}
+        write_transforms(root / f"transforms_{split}.json", {"camera_angle_x": 0.7}, frames)
 
 
 def write_nerfstudio(root: Path) -> None:
     write_photos(root / "images")
-    lens: dict[str, Any] = {"camera_model": "OPENCV", "fl_x": 14.0, "fl_y": 14.5, "cx": 8.2, "cy": 6.1}
-    lens |= {"w": 16, "h": 12}
-    frames: list[dict[str, Any]] = [{"file_path": f"images/{i}.png", "transform_matrix": _matrix(i)} for i in range(3)]
-    frames[1] |= {"camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k2": -0.01, "k3": 0.003, "k4": 0.001}
-    (root / "transforms.json").write_text(json.dumps({**lens, "k1": -0.05, "k2": 0.01, "p1": 0.001, "frames": frames}))
+    lens = {"camera_model": "OPENCV", "fl_x": 14.0, "fl_y": 14.5, "cx": 8.2, "cy": 6.1, "w": 16, "h": 12}
+    fisheye = {"camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k2": -0.01, "k3": 0.003, "k4": 0.001}
+    frames: dict[str, Object] = {"images/0.png": {}, "images/1.png": fisheye, "images/2.png": {}}
+    write_transforms(root / "transforms.json", {**lens, "k1": -0.05, "k2": 0.01, "p1": 0.001}, frames)
 
 
 def write_image(folder: Path, suffix: str, channels: int = 3) -> None:
