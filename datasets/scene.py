@@ -60,8 +60,8 @@ class Views:
     alphas: Tensor | None = None
     border_mask: Tensor | None = None
     valid_mask: Tensor | None = None
-    turned: tuple[bool, ...] | None = None
     gains: Tensor | None = None
+    turned: tuple[bool, ...] | None = None
 
     def __post_init__(self) -> None:
         count = len(self.names)

@@ -60,7 +60,8 @@ class Densifier:
 
     Args:
         model: the Gaussians.
-        optimizer: holds each of the model's parameters; other parameters in it stay as they are. Its state for a
+        optimizer: ONE optimizer that holds each of the model's parameters (gsplat's dict of optimizers becomes one Adam
+            with a group for each); other parameters in it stay as they are. Its state for a
             parameter consists of scalars and of tensors of that parameter's shape which start at 0: Adam, SGD,
             RMSprop; not LBFGS or Adafactor.
         extent: size of the camera rig in world units, > 0, see :func:`camera_extent`.
@@ -108,6 +109,8 @@ class Densifier:
         ):
             if not fits:
                 raise ValueError(f"{name}: expected {expected}, got {number}")
+        if not hasattr(optimizer, "param_groups"):
+            raise TypeError(f"optimizer: expected one torch.optim.Optimizer, got {type(optimizer).__name__}")
         if isinstance(optimizer, _UNSUPPORTED_OPTIMIZERS):
             raise ValueError(f"optimizer: expected Adam, SGD or the like, got {type(optimizer).__name__}")
         self.model = model

@@ -57,9 +57,11 @@ class DropGaussian(nn.Module):
     Args:
         p: as in :func:`drop_gaussian`, at the end of the schedule. The attribute may be set anew.
         schedule: "linear" (the paper's), "constant", or a function from progress in [0, 1] to a factor.
-        seed: None draws from torch's default generator, as `nn.Dropout` does. An integer gives it a stream of its own,
-            which copies continue: another for each rank, and none within `torch.utils.checkpoint`.
-        device: where that stream draws. On the CPU masks do not depend on the device of the opacities.
+        seed: None draws from torch's default generator, as `nn.Dropout` does. An integer gives the layer a stream of
+            its own, which copies continue: give each rank another seed. Do not use a seed within
+            `torch.utils.checkpoint`, which would draw another mask when it computes again.
+        device: where that stream draws. The default, the CPU, gives the same masks on every device, and copies N
+            numbers to it in each call.
         scale: as in :func:`drop_gaussian`.
 
     Raises:
@@ -110,7 +112,10 @@ class DropGaussian(nn.Module):
 
     @property
     def last_scale(self) -> Tensor | None:
-        """Detached factors of the last opacities in `train()`; None before, in `eval()`, a copy, after `torch.func`."""
+        """What the last call in `train()` multiplied each opacity by, in their shape, detached.
+
+        None before the first such call, in `eval()`, in a copy of the layer, and after a call within `torch.func`.
+        """
         return self._last_scale if self.training else None
 
     def forward(self, opacities: Tensor) -> Tensor:

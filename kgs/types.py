@@ -29,7 +29,7 @@ class RasterOptions:
             are not exact (Kornia does not divide by less than 1e-8).
         eps2d: variance in px^2 added to the diagonal of each footprint, >= 0: the low-pass filter of 3DGS.
         alpha_threshold: alphas below it are skipped, in [0, 1). It trades accuracy for time: 0 is exact, and the
-            error is at most the number of layers times this value.
+            error is at most this value times the number of Gaussians that cover the pixel.
         transmittance_stop: transmittance below it counts as 0, in [0, 1); the error is at most this value.
         max_bytes: bound for the working memory of one call in bytes, without what is kept per Gaussian and per pixel.
             An image that needs more is rendered in row slices, which the backward pass computes again.
@@ -201,7 +201,8 @@ class ProjectedGaussians:
             `.grad`, as :meth:`kgs.Densifier.observe` needs.
         factors: `(M, 2, 3)`, the product J W R S in pixels: the covariance is `factors @ factors.mT + eps2d I`.
         depths: z in the camera frame, `(M,)`.
-        radii: ceil(3 sqrt(largest variance)) in pixels, independent of the opacity, `(M,)`.
+        radii: ceil(3 sqrt(largest variance)) in pixels, independent of the opacity, `(M,)`. `radius_clip` and
+            `meta["radii"]` of `kgs.rasterization` take 3.33 standard deviations along each axis instead.
         opacities: `(M,)`; those of an antialiased render are multiplied by its factor.
         colors: `(M, 3)`, or features `(M, D)`, or `(M, 0)` if no image was requested.
         image_size: (height, width) in pixels.
@@ -236,10 +237,10 @@ class ProjectedGaussians:
 
 @dataclass(frozen=True, eq=False)
 class Composited:
-    """Sums over layers, before background and normalisation."""
+    """Sums over the Gaussians of each pixel, before background and normalisation."""
 
     features: Tensor  # sum of w times features, (C, F, H, W)
-    transmittance: Tensor  # T behind the last layer, (C, 1, H, W)
+    transmittance: Tensor  # T behind the last Gaussian, (C, 1, H, W)
     median_depth: Tensor | None  # (C, 1, H, W), without gradient
     tile_size: int  # side of the tiles that were used, in pixels
 
@@ -251,8 +252,8 @@ class Rendering:
     Args:
         image: `(C, 3, H, W)`, or `(C, D, H, W)` of features, not clamped.
         alpha: `(C, 1, H, W)`, 1 - transmittance.
-        depth: `(C, 1, H, W)`, the mean depth weighted by contribution; 0 where alpha < 1e-6.
-        median_depth: `(C, 1, H, W)`, depth of the first layer behind which the transmittance is below one half;
+        depth: `(C, 1, H, W)`, the mean depth weighted by contribution, so divided by alpha; 0 where alpha < 1e-6.
+        median_depth: `(C, 1, H, W)`, depth of the first Gaussian behind which the transmittance is below 1/2;
             0 where there is none. No gradient.
         projected: the visible Gaussians.
         normal: `(C, 3, H, W)`, the sum of contribution times normal: the shortest axis of each Gaussian, of length 1,

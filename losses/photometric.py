@@ -59,7 +59,10 @@ def photometric_loss(
     moments: TargetMoments | None = None,
     backend: str = "auto",
 ) -> Tensor:
-    """Mean absolute difference plus `dssim_weight` times 1 - SSIM.
+    """Mean absolute difference plus `dssim_weight` times 1 - SSIM, as in the release of DropGaussian.
+
+    3DGS and gsplat weight (1 - l) L1 + l (1 - SSIM). Their l = 0.2 is `0.8 * photometric_loss(image, target, 0.25)`,
+    but for the border of SSIM.
 
     Images in float32 of at least 11 x 11 pixels take a path with an analytic gradient, three times as fast as Kornia's;
     all others, targets that require a gradient, and `fast=False` take `kornia.losses.ssim_loss`.

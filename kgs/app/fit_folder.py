@@ -35,7 +35,7 @@ from kgs.fit.config import FitConfig, min_side
 from kgs.fit.fit import Fit
 from kgs.fit.measures import measure
 from kgs.fit.plan import Plan, expected_memory, gaussian_limit, make_plan
-from kgs.fit.prune import prune
+from kgs.fit.pruning import prune
 from kgs.fit.run import choose_points, decide
 from kgs.fit.trainer import Trainer
 from kgs.metrics.lpips import Lpips

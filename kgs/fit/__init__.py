@@ -3,14 +3,16 @@
 `initial_points` needs only the required packages; the others need the extra `app`.
 
 Examples:
-    >>> from kgs.fit import FitConfig, Trainer, initial_points, make_plan
+    >>> from kgs.fit import FitConfig, Trainer, choose_points, decide, make_plan, prune
     >>> from kgs.datasets import synthetic_scene
     >>> scene = synthetic_scene(train_views=2, size=(16, 16))
-    >>> plan = make_plan(scene, FitConfig(steps=2))
-    >>> trainer = Trainer(scene, plan, initial_points(scene.train, "random", count=50))
+    >>> config = FitConfig(steps=2, init="random", init_points=50)
+    >>> points = choose_points(scene, config)
+    >>> plan = decide(make_plan(scene, config), points)
+    >>> trainer = Trainer(scene, plan, points)
     >>> while trainer.step < plan.schedule.steps:
     ...     loss = trainer.train_step()
-    >>> fit = trainer.result()
+    >>> fit = prune(trainer.result())  # as `fit_scene(scene, config)`
 """
 
 from typing import TYPE_CHECKING
@@ -25,7 +27,8 @@ if TYPE_CHECKING:
     from .fit import Fit
     from .measures import measure
     from .plan import Plan, make_plan
-    from .run import choose_points, fit_scene
+    from .pruning import prune
+    from .run import choose_points, decide, fit_scene
     from .trainer import Trainer
 
 __all__ = [
@@ -37,6 +40,8 @@ __all__ = [
     "initial_points",
     "choose_points",
     "make_plan",
+    "decide",
+    "prune",
     "fit_scene",
     "measure",
 ]
@@ -49,7 +54,8 @@ __getattr__, __dir__ = lazy_names(
         "kgs.fit.plan": ("Plan", "make_plan"),
         "kgs.fit.trainer": ("Trainer",),
         "kgs.fit.fit": ("Fit",),
-        "kgs.fit.run": ("choose_points", "fit_scene"),
+        "kgs.fit.run": ("choose_points", "decide", "fit_scene"),
+        "kgs.fit.pruning": ("prune",),
         "kgs.fit.measures": ("measure",),
     },
 )

@@ -24,7 +24,7 @@ from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 
 from .fit import Fit
-from .prune import psnr_per_view
+from .pruning import psnr_per_view
 
 KINDS = ("giants", "needles", "floaters")
 MAX_STRENGTH = 100.0

@@ -64,7 +64,7 @@ class ExposureDecision:
 
 @dataclass(frozen=True)
 class PruningDecision:
-    """What was kept after the fit, see :mod:`kgs.fit.prune`.
+    """What was kept after the fit, see :mod:`kgs.fit.pruning`.
 
     Args:
         fitted: the number of Gaussians before.

@@ -13,7 +13,7 @@ from .exposure import decide_exposure
 from .fit import Fit
 from .overlap import decide_by_overlap
 from .plan import Plan, make_plan
-from .prune import prune
+from .pruning import prune
 from .trainer import Trainer
 from .view_dependence import decide_degree
 
@@ -38,7 +38,15 @@ def fit_scene(scene: Scene, config: FitConfig | None = None, *, bar: ProgressBar
 
 
 def decide(plan: Plan, points: InitialPoints) -> Plan:
-    """Decide what the photos tell before a fit: its steps, drop rate and harmonics, and whether exposures differ."""
+    """The plan with what the photos settle: steps, drop rate, degree of the harmonics, and gains.
+
+    Args:
+        plan: of :func:`make_plan`.
+        points: the initial points of the fit, of which "dense" and "sift" tell how many photos show the same surface.
+
+    Returns:
+        The plan with its `decisions`; what the configuration gives stays as it is.
+    """
     return decide_exposure(decide_degree(decide_by_overlap(plan, points), points), points)
 
 

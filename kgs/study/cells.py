@@ -22,7 +22,7 @@ from kgs.fit.config import PRESETS, FitConfig
 from kgs.fit.fit import Fit
 from kgs.fit.measures import measure
 from kgs.fit.plan import make_plan
-from kgs.fit.prune import prune
+from kgs.fit.pruning import prune
 from kgs.fit.run import choose_points, decide
 from kgs.fit.trainer import Trainer
 from kgs.init_points import InitialPoints

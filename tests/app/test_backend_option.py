@@ -13,7 +13,7 @@ from kgs.app.saved_fit import load_fit
 from kgs.app.scene_request import SceneRequest
 from kgs.fit import FitConfig, Trainer
 from kgs.fit.plan import make_plan
-from kgs.fit.prune import prune
+from kgs.fit.pruning import prune
 
 CONFIG = FitConfig(steps=3, evaluations=1, init="random", init_points=50)
 

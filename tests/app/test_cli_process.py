@@ -108,7 +108,7 @@ MISTAKES = [  # words, what is said of them, and a package that is not installed
     ("fit photos -o out --downscale 0.5", "--downscale: expected", ""),
     ("fit photos -o out --hold-out 1", "--hold-out: expected", ""),
     ("fit photos -o out --lpips-weights empty", "empty/vgg16_features.npz: expected", ""),
-    ("fit photos -o photos", "photos: holds files of a scene", ""),
+    ("fit photos -o photos", "photos: holds photos or files of a scene", ""),
     ("fit missing -o out", "missing: expected", ""),
     ("fit empty -o out", "empty: expected photos", ""),
     ("fit two -o out", "two: expected at least 3 photos, found 2", ""),

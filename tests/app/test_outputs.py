@@ -39,9 +39,9 @@ def test_no_results_among_the_files_of_a_scene(tmp_path):
     (scene / "poses_bounds.npy").write_bytes(b"")
     (scene / "images" / "photo.JPG").write_bytes(b"")
     for out in (scene, scene / "images", tmp_path / "." / "scene" / "images"):
-        with pytest.raises(DataError, match="holds files of a scene"):
+        with pytest.raises(DataError, match="files of a scene"):
             check_folder(out, scene)
-    with pytest.raises(DataError, match="holds files of a scene"):
+    with pytest.raises(DataError, match="files of a scene"):
         check_folder(scene, tmp_path / "another scene")
     check_folder(scene / "results", scene)
     with replacing(scene / "results", "renders") as new:

@@ -725,7 +725,7 @@ def test_two_clicked_points_have_a_distance(opened: Browser) -> None:
     distance = np.linalg.norm(points[1] - points[0])
     assert float(said.split()[0]) == pytest.approx(distance, rel=5e-3)  # a click is at a whole pixel of the page
     words = opened.run("document.querySelector('.measured code').textContent").split()
-    assert words[:4] == ["kgs", "scale", "FOLDER", "--by"]
+    assert words[:4] == ["kgs", "scale", "OUT", "--by"]
     shown = [np.array([float(value) for value in word.split(",")]) for word in words[4:6]]
     for one, expected in zip(shown, points, strict=True):
         np.testing.assert_allclose(one, expected + np.array([1000, 0, -3]), atol=5e-3 * distance)

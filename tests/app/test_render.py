@@ -50,7 +50,7 @@ def hashes(folder):
 @pytest.mark.parametrize("out", ["images", "."])
 def test_nothing_is_written_among_the_photos(splat, llff, out):
     before = hashes(llff.parent)
-    with pytest.raises(DataError, match="holds files of a scene"):
+    with pytest.raises(DataError, match="files of a scene"):
         render(splat, cameras=llff, out=llff / out)
     assert hashes(llff.parent) == before
 

@@ -32,7 +32,7 @@ from kgs.fit import trainer as trainer_module
 from kgs.fit.checkpoint import load_checkpoint, previous, save_checkpoint
 from kgs.fit.config import DROP, FitConfig, Recipe
 from kgs.fit.plan import with_step_defaults
-from kgs.fit.prune import prune
+from kgs.fit.pruning import prune
 from kgs.fit.trainer import Trainer
 
 CONFIG = FitConfig(steps=3, evaluations=1, max_gaussians=300, sh_degree=1, recipe=Recipe(grad_threshold=1e-5))

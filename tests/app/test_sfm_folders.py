@@ -85,7 +85,7 @@ FOLDERS = {  # what is in them, and what is said of it
     ),
     "one twice": (
         lambda at: save(at, [*planes()[:2], planes()[1]]),
-        ("2.png: is the same photo as 1.png: remove one of them",),
+        ("2.png: is the same photo as 1.png: ",),
     ),
     "cropped": (
         lambda at: save(at, [*planes()[:2], planes()[0][:120]]),
@@ -337,8 +337,8 @@ def found(monkeypatch):
     [
         *((f"{name}/deeper/IMG_1.HEIC", "") for name in ("images", "unfinished")),
         *((name, "") for name in ("unfinished/notes.txt", "images/notes.txt", "checkpoint.safetensors")),
-        ("sparse/0/deeper/IMG_1.HEIC", "holds files of a scene"),
-        ("sparse/0/cameras.bin", "holds files of a scene"),
+        ("sparse/0/deeper/IMG_1.HEIC", "files of a scene"),
+        ("sparse/0/cameras.bin", "files of a scene"),
         *((name, "did not write") for name in ("photos.json", "images", "images/1.png", "unfinished/photos.json")),
     ],
 )

@@ -61,10 +61,10 @@ def test_disagreement_is_the_angle_between_relative_rotations(angle):
 def test_two_solvers_have_to_agree(tmp_path):
     first, second = cameras(), cameras(turn=1.9, points=(99, 99, 99))
     assert judge(tmp_path, [first, second], NAMES, 1000, PAIRS) == (1, pytest.approx(1.9))  # it sees more points
-    with pytest.raises(DataError, match="two solvers differ by 2.1 degrees about b and c"):
+    with pytest.raises(DataError, match="disagree about b and c"):
         judge(tmp_path, [first, cameras(turn=2.1)], NAMES, 1000, PAIRS)
     for other in (None, cameras(missing=("c",))):
-        with pytest.raises(DataError, match=r"one could not place .*c, so that nothing confirms the other"):
+        with pytest.raises(DataError, match=r"only one could place .*c, so that nothing confirms it"):
             judge(tmp_path, [first, other], NAMES, 1000, PAIRS)
     few = cameras(points=(90, 20, 90))  # enough to confirm the other
     assert judge(tmp_path, [few, first], NAMES, 1000, PAIRS)[0] == 1
@@ -92,7 +92,7 @@ def test_two_solvers_have_to_agree_on_the_focal_length(tmp_path):
     for found in ([cameras(), far], [far, cameras()]):
         with pytest.raises(DataError, match=r"differ by a factor of 1\.16, more than 1\.15.*3 to 20 degrees apart"):
             judge(tmp_path, found, NAMES, 1000, PAIRS)
-    with pytest.raises(DataError, match="3 degrees about.*places between"):  # the graver one first
+    with pytest.raises(DataError, match="disagree about .*3 degrees.*places between"):  # the graver one first
         judge(tmp_path, [cameras(), cameras(focal=690, turn=3.0)], NAMES, 1000, PAIRS)
 
 

@@ -17,7 +17,7 @@ from kgs.app.files.glb import save_glb
 from kgs.app.page.data import pack
 from kgs.compressed_ply import save_compressed_ply
 from kgs.datasets import Views
-from kgs.fit.prune import contributions
+from kgs.fit.pruning import contributions
 from kgs.model import GaussianModel
 from kgs.ply import load_ply, save_ply
 from kgs.types import RasterOptions

@@ -16,7 +16,7 @@ from kgs.fit.decisions import Decisions, ExposureDecision
 from kgs.fit.exposure import MIN_RATIO, decide_exposure, estimate_gains, with_exposure
 from kgs.fit.measures import measure, measure_again
 from kgs.fit.plan import make_plan
-from kgs.fit.prune import psnr_per_view
+from kgs.fit.pruning import psnr_per_view
 from kgs.fit.run import choose_points, decide, fit_scene
 from kgs.fit.targets import targets
 from kgs.fit.trainer import Trainer

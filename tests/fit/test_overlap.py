@@ -20,7 +20,7 @@ from kgs.fit.overlap import (
     steps_for,
 )
 from kgs.fit.plan import FEW, MANY, make_plan
-from kgs.fit.prune import left_out
+from kgs.fit.pruning import left_out
 from kgs.fit.run import fit_scene
 from kgs.fit.trainer import Trainer
 from kgs.init_points import InitialPoints

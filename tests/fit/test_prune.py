@@ -12,7 +12,7 @@ from kornia.geometry.camera import PinholeCamera
 from kgs import GaussianModel
 from kgs.fit import Fit, FitConfig
 from kgs.fit.decisions import Decisions, DegreeDecision
-from kgs.fit.prune import QUANTUM, TOLERANCE, contributions, left_out, prune
+from kgs.fit.pruning import QUANTUM, TOLERANCE, contributions, left_out, prune
 from kgs.reference import render
 from kgs.types import RasterOptions
 

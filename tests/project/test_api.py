@@ -24,7 +24,7 @@ INVENTORY = {
     "kgs.losses": "TargetMoments photometric_loss target_moments",
     "kgs.datasets": "Scene Views load_scene synthetic_scene",
     "kgs.fit": """
-        Fit FitConfig InitialPoints Plan Trainer choose_points fit_scene initial_points make_plan measure
+        Fit FitConfig InitialPoints Plan Trainer choose_points decide fit_scene initial_points make_plan measure prune
     """,
     "kgs.reference": "Layers layers render",
 }

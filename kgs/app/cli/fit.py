@@ -140,7 +140,7 @@ def fit(
     from kgs.app.stages import Stages
     from kgs.datasets import load_scene
     from kgs.datasets.field import field_size
-    from kgs.fit.prune import left_out
+    from kgs.fit.pruning import left_out
     from kgs.init_points.files import read_points
     from kgs.metrics.evaluate import as_text
     from kgs.metrics.lpips import Lpips

@@ -24,7 +24,7 @@ from kgs.datasets.splits import select_evenly
 from kgs.fit.decisions import Decisions
 from kgs.fit.fit import Fit
 from kgs.fit.measures import used_init
-from kgs.fit.prune import contributions, left_out
+from kgs.fit.pruning import contributions, left_out
 from kgs.types import Gaussians
 
 from .content import PageContent, PagePhotos, PageSplat, PageText

@@ -45,7 +45,8 @@ class Ruler {
     const offset = this.viewer.scene.offset ?? [0, 0, 0];
     const [a, b] = this.points.map((point) => add(point, offset).map((value) => value.toFixed(digits)).join(","));
     this.show(`${distance.toPrecision(DISTANCE_DIGITS)} units apart. With the true length in place of LENGTH, in metres `
-      + "say, this command scales splat, cameras and page to it:", `kgs scale FOLDER --by ${a} ${b} LENGTH -o OUT`);
+      + "say, this command scales splat, cameras and page to it; OUT is the folder of this page, METRES a new one:",
+      `kgs scale OUT --by ${a} ${b} LENGTH -o METRES`);
   }
 
   show(text, command = "") {

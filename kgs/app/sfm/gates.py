@@ -23,7 +23,7 @@ MAX_RATIO = 1.15  # of their focal lengths
 MIN_RISE = 0.03  # relative growth of the squared errors if the focal length is a quarter off
 MIN_SHIFT = 1.0  # pixels; photos whose matches move less in the median were taken from one place
 _PLANAR = 0.97  # share of matches that one homography explains; a scene with depth has a pair with a lower one
-_WITHOUT = "A fit without some photos: take them out of the folder"
+_WITHOUT = "To fit only some of the photos, take the others out of the folder"
 _FORWARD = (
     "The camera moved along its view, as when walking forward: what lies ahead hardly moves between such photos, and "
     "nothing tells how far away it is. What helps most: step sideways, not forward, so that neighbours are 3 to 20 "
@@ -121,7 +121,8 @@ def judge(
         raise DataError(folder, "", refusal(reasons[0], names, pairs, forward, _missing(solutions[0], names)))
     for cameras in solutions:  # nothing confirms a photo that only one solver registered
         if missing := _missing(cameras, names):
-            reason = f"of two solvers one could not place {', '.join(missing)}, so that nothing confirms the other"
+            who = ", ".join(missing)
+            reason = f"kgs finds the cameras in two ways, and only one could place {who}, so that nothing confirms it"
             raise DataError(folder, "", refusal([reason], names, pairs, forward, missing))
     both = [cameras for cameras in solutions if cameras]
     if doubt := focal_doubt(both):
@@ -129,7 +130,8 @@ def judge(
     degrees, pair = disagreement(*both)
     if degrees > MAX_DEGREES:
         reason = (
-            f"two solvers differ by {degrees:.3g} degrees about {' and '.join(pair)}; expected at most {MAX_DEGREES:g}"
+            f"kgs finds the cameras in two ways, and they disagree about {' and '.join(pair)} (by "
+            f"{degrees:.3g} degrees; expected at most {MAX_DEGREES:g})"
         )
         raise DataError(folder, "", refusal([reason], names, pairs, forward))
     if doubt := focal_difference(both):
@@ -190,7 +192,8 @@ def table(names: Sequence[str], pairs: Pairs) -> str:
     long = max(len(name) for name in names)
     head = " " * (4 + long) + "".join(f" {i + 1:>{width}}" for i in range(len(names)))
     rows = [f"{i + 1:>3} {name:<{long}}" + _row(name, names, pairs, width) for i, name in enumerate(names)]
-    return "\n".join(["Matches of each pair:", head, *rows])
+    meaning = f"{MIN_MATCHES} or more hold two photos together; a row of small numbers is the photo to take again"
+    return "\n".join([f"Matches of each pair ({meaning}):", head, *rows])
 
 
 def why_no_cameras(names: Sequence[str], pairs: Pairs, geometries: Mapping[tuple[str, str], PairGeometry]) -> str:

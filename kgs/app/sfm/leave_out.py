@@ -35,7 +35,8 @@ def unlike_others(photos: list[OpenPhoto]) -> dict[str, str]:
     left = {name: f"it is the same photo as {other}" for name, other in copied.items()}
     if copied and len(photos) - len(left) < MIN_PHOTOS:
         name, other = next(iter(copied.items()))
-        reason = f"is the same photo as {other}: remove one of them. A second look needs a second place"
+        advice = "two copies show no depth. Remove one, and take another photo from a step to the side"
+        reason = f"is the same photo as {other}: {advice}"
         raise DataError(photos[0].path.with_name(name), "", reason)
     photos = [photo for photo in photos if photo.name not in left]
     shapes = by_shape(photos)

@@ -28,6 +28,9 @@ def prune(fit: Fit) -> Fit:
     lowest degree of harmonics for which the same holds and which changes no pixel value by more than `QUANTUM`.
 
     `decisions.gaussians` of the pruned fit says how many were kept.
+
+    Args:
+        fit: a fit that is done.
     """
     if fit.settings is not None and not fit.settings.prune:
         return fit
