@@ -60,7 +60,7 @@ def test_frames_are_spread_by_motion_and_sharp(tmp_path):
 @pytest.mark.parametrize(("degrees", "count", "expected"), [(9, None, 4), (155, None, 17), (40, 5, 5), (40, 20, 20)])
 def test_how_many_frames(tmp_path, degrees, count, expected):
     """Neighbours are 3 to 10 degrees apart, unless a number is given."""
-    equal = np.degrees(np.arctan(np.radians(np.arange(0, degrees + 0.1, 0.5)))).tolist()  # ways in the image
+    equal = np.degrees(np.arctan(np.radians(np.arange(0, degrees + 0.1)))).tolist()  # ways in the image
     assert len(take(write_video(tmp_path / "clip.avi", equal), count)) == expected
 
 
