@@ -178,8 +178,6 @@ def test_presets_and_details_are_starts_that_options_change(folder, tmp_path, mo
 @pytest.mark.parametrize(
     ("words", "preset"),
     [
-        ("--preset paper --preset=plain", "plain"),
-        ("--preset=plain --preset paper", "paper"),
         ("--preset=plain --title=--preset --preset=auto", "auto"),
         ("--preset plain -- --preset paper", "plain"),
         ("--title --preset=plain", "plain"),  # tyro refuses this one

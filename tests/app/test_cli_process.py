@@ -103,6 +103,8 @@ MISTAKES = [  # words, what is said of them, and a package that is not installed
     ("fit twelve -o out --hold-out 4 --views 11", "--views: expected at most 10 of 12 photos of which 2", ""),
     ("fit film.mp4 -o out --frames 5 --views 6", "--views: expected at most 5 of 5 frames, got 6", ""),
     ("fit film.mp4 -o out --hold-out 2 --views 30", "--views: expected at most 19 of 36 frames", ""),
+    ("fit film.mp4 -o out --frames 2", "--frames: expected", ""),
+    ("fit photos -o out --frames 12", "--frames: expected", ""),
     ("fit photos -o out --init scene", "--init: expected another one for photos", ""),
     ("fit posed -o out --init scene", "--init: expected another one for the layout COLMAP", ""),
     ("fit photos -o out --downscale 0.5", "--downscale: expected", ""),

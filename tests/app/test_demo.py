@@ -2,7 +2,6 @@
 
 import json
 import os
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,7 +13,7 @@ from PIL import Image
 
 import kgs
 from kgs.app.cli.demo import PHOTO_SIZE, PHOTOS, check_size, demo, load_demo
-from kgs.fit.config import DEMO, DROP
+from kgs.fit.config import DROP
 from kgs.geometry import camera_centers
 
 TINY = ("--size", "32", "40")
@@ -88,9 +87,9 @@ def test_pictures_that_are_too_small_are_refused(tmp_path):
     assert not [*tmp_path.iterdir()]
 
 
-def test_photos_are_fitted_with_dropping(tmp_path, capsys, monkeypatch):
+def test_photos_are_fitted_with_dropping(tmp_path, capsys, monkeypatch, points):
     """From random points: depth maps take most of the demo's time, and have tests of their own."""
-    monkeypatch.setattr("kgs.app.cli.demo.DEMO", replace(DEMO, init="random"))
+    monkeypatch.setattr("kgs.fit.run.choose_points", lambda *_: points)
     assert run("demo", "-o", tmp_path, "--steps", 2, *TINY) == 0
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert set(metrics) == {"with"}

@@ -105,11 +105,8 @@ def test_what_is_changed_is_refused_before_any_work(out: Path) -> None:
     assert contents(out) == NEW | {"test/1.txt": "mine", "notes.txt": "mine"}
 
 
-@pytest.mark.parametrize("kind", ["page", "fit"])
-def test_results_of_another_command_are_refused(out: Path, kind: str) -> None:
-    with refused("a.txt"):
-        check_free(out, kind, ["a.txt"])
-    replace_all(out, {"c.txt": "new"}, kind)
+def test_results_of_another_command_stay(out: Path) -> None:
+    replace_all(out, {"c.txt": "new"}, "page")
     assert contents(out) == OLD | {"c.txt": "new"}
 
 
@@ -210,14 +207,6 @@ def test_commands_in_one_folder_lose_no_entries(tmp_path: Path) -> None:
     assert [process.wait() for process in processes] == [0, 0, 0]
     assert sorted(map(len, read_marker(tmp_path).values())) == [20, 40]
     assert not [path for path in tmp_path.iterdir() if path.is_dir()]
-
-
-def test_a_folder_at_work_is_not_removed(tmp_path: Path) -> None:
-    with replacing(tmp_path, "page") as outer:
-        with replacing(tmp_path, "page") as inner:
-            write(inner, {"b.html": "new"})
-        write(outer, {"a.html": "new"})
-    assert contents(tmp_path) == {"a.html": "new", "b.html": "new"}
 
 
 def test_what_the_user_has_in_an_unfinished_folder_stays(tmp_path: Path) -> None:
@@ -389,11 +378,13 @@ def kill(error: BaseException, *_: Any, **__: Any) -> None:
     raise error
 
 
-def test_where_there_are_no_locks_no_folder_is_taken_for_an_abandoned_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("has_locks", [True, False])
+def test_a_folder_at_work_is_not_taken_for_an_abandoned_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_locks: bool
 ) -> None:
-    pytest.importorskip("fcntl")
-    monkeypatch.setattr("fcntl.flock", partial(kill, OSError(errno.ENOLCK, "No locks available")))
+    if not has_locks:
+        pytest.importorskip("fcntl")
+        monkeypatch.setattr("fcntl.flock", partial(kill, OSError(errno.ENOLCK, "No locks available")))
     with replacing(tmp_path, "page") as outer:
         with replacing(tmp_path, "page") as inner:
             write(inner, {"b.html": "new"})

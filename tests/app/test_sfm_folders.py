@@ -275,13 +275,6 @@ def test_walking_forward(tmp_path, refused):
     assert "places between" not in text
 
 
-def test_photos_that_would_be_shrunk_to_nothing(folder, refused):
-    """Told before their cameras are found."""
-    save(folder, [cv2.resize(image, (640, 480)) for image in planes()])
-    said = refused(folder, options=("--downscale", "40"))
-    assert said == "kgs: --downscale: expected 32 pixels or more of the longer side, got 16x12 of 640x480\n"
-
-
 def test_a_blurred_photo_is_told(folder):
     images = planes()
     images[1] = cv2.GaussianBlur(images[1], (0, 0), 2.0)

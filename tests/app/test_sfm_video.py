@@ -210,15 +210,6 @@ def test_which_video_is_meant(tmp_path):
     assert find_video(tmp_path / "nothing.mp4") is None
 
 
-@pytest.mark.parametrize(("frames", "folder"), [("2", False), ("12", True)])
-def test_frames_are_of_a_video_and_three_at_least(tmp_path, frames, folder, capsys):
-    video = write_video(tmp_path / "clip.avi", [0.0])
-    if folder:
-        cv2.imwrite(str(tmp_path / "0.png"), np.zeros((8, 8, 3), np.uint8))
-    assert run("fit", tmp_path if folder else video, "-o", tmp_path / "out", "--frames", frames) == 2
-    assert "--frames: expected" in capsys.readouterr().err
-
-
 def test_a_video_whose_header_has_no_number_of_frames(tmp_path, monkeypatch):
     """As recorders write it that do not know yet how long it will be."""
 
