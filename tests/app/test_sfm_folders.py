@@ -79,6 +79,7 @@ FOLDERS = {  # what is in them, and what is said of it
         ("1 of 4 photos cannot be read (raw.dng)", "sips", "magick", "Most Compatible"),
     ),
     "video called JPEG": (lambda at: save(at, planes(), z_jpg=VIDEO), ("z.jpg: is a HEIC photo or a video", "sips")),
+    "empty": (lambda at: save(at, planes(), z_jpg=b""), ("z.jpg: expected an image, got an empty file",)),
     "videos": (
         lambda at: save(at, [], clip_MOV=VIDEO, other_mp4=VIDEO),
         ("several videos (clip.MOV, other.mp4): name one",),
@@ -174,11 +175,6 @@ def test_what_looks_like_a_photo_and_is_not_taken_is_named(folder, refused):
         assert name in said
     for name in ("IMG_7", "notes", "BM.txt", "IMG_8", "empty"):
         assert name not in said
-
-
-def test_an_empty_file_is_named(folder, refused):
-    save(folder, planes(), z_jpg=b"")
-    refused(folder, "z.jpg: expected an image, got an empty file")
 
 
 @pytest.mark.parametrize("name", ["0_mask.png", "0.png.png", "mask_0.PNG", "Masks/0.png", "masks/0-mask.png"])

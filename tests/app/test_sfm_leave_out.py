@@ -6,26 +6,18 @@ import cv2
 import numpy as np
 import pytest
 from photo_folders import planes, write_photos
+from solved_cameras import solved as cameras
 
 from kgs._support.progress import silent
 from kgs.app.sfm.gates import MAX_DEGREES, gap
 from kgs.app.sfm.leave_out import unlike_others, without_cameras, without_overlap
-from kgs.app.sfm.map import Cameras, PairGeometry
+from kgs.app.sfm.map import PairGeometry
 from kgs.app.sfm.match import lenses_of
 from kgs.app.sfm.read import open_photos, read_photos
 
 NAMES = list("abcdef")
 PAIRS = dict.fromkeys(pairwise(NAMES), 200)
 DEEP = dict.fromkeys(PAIRS, PairGeometry(30.0, 0.5))
-
-
-def cameras(names=NAMES, points=None, turned=None, focals=None):
-    """Cameras of these photos, where those in `turned` are turned by so many degrees."""
-    turns = dict.fromkeys(names, 0.0) | (turned or {})
-    rotations = {name: cv2.Rodrigues(np.array([0.0, np.radians(turns[name]), 0.0]))[0] for name in names}
-    counts = dict.fromkeys(names, 90) | (points or {})
-    lenses = dict.fromkeys(names, 800.0) | (focals or {})
-    return Cameras(lenses, rotations, dict.fromkeys(names, np.zeros(3)), counts, None, 0.1)
 
 
 def test_a_photo_of_another_place_or_from_the_same_place():
@@ -52,20 +44,25 @@ def test_three_photos_remain_and_more_than_in_any_other_group():
 @pytest.mark.parametrize(
     ("first", "second", "left", "said"),
     [
-        (cameras(), cameras(), "", ""),
+        (cameras(NAMES), cameras(NAMES), "", ""),
         (cameras(NAMES[1:]), cameras(NAMES[1:]), "a", "neither of two solvers"),
         (cameras(NAMES[1:]), cameras(NAMES[:5]), "af", "only one of two solvers"),
-        (cameras(points={"c": 49}), cameras(points={"c": 20}), "c", "only 49 points"),
-        (cameras(points={"c": 49}), cameras(), "", ""),  # one solver sees it well, the other confirms it
-        (cameras(), cameras(turned={"d": 2 * MAX_DEGREES}), "d", "4 degrees apart"),
-        (cameras(), cameras(turned={"d": 40.0, "e": 80.0}), "de", "degrees apart"),
-        (cameras(), cameras(turned={"d": 0.9 * MAX_DEGREES}), "", ""),
+        (cameras(NAMES, points={"c": 49}), cameras(NAMES, points={"c": 20}), "c", "only 49 points"),
+        (cameras(NAMES, points={"c": 49}), cameras(NAMES), "", ""),  # one solver sees it well, the other confirms it
+        (cameras(NAMES), cameras(NAMES, turned={"d": 2 * MAX_DEGREES}), "d", "4 degrees apart"),
+        (cameras(NAMES), cameras(NAMES, turned={"d": 40.0, "e": 80.0}), "de", "degrees apart"),
+        (cameras(NAMES), cameras(NAMES, turned={"d": 0.9 * MAX_DEGREES}), "", ""),
         (cameras(NAMES[1:]), cameras(NAMES[1:], turned={"d": 40.0}), "a", "neither"),  # d is looked at without a
-        (cameras(), cameras(turned={n: 10.0 * i for i, n in enumerate(NAMES)}), "", ""),  # no three agree
+        (cameras(NAMES), cameras(NAMES, turned={n: 10.0 * i for i, n in enumerate(NAMES)}), "", ""),  # no three agree
         (cameras(NAMES[:4]), cameras(NAMES[2:]), "", ""),  # two would remain
-        (cameras(focals={"e": 1200.0}), cameras(focals={"e": 1600.0}), "e", "factor of 1.33 about the focal length"),
-        (cameras(focals={"e": 1200.0}), cameras(focals={"e": 1250.0}), "", ""),
-        (cameras(), None, "", ""),
+        (
+            cameras(NAMES, focals={"e": 1200.0}),
+            cameras(NAMES, focals={"e": 1600.0}),
+            "e",
+            "factor of 1.33 about the focal length",
+        ),
+        (cameras(NAMES, focals={"e": 1200.0}), cameras(NAMES, focals={"e": 1250.0}), "", ""),
+        (cameras(NAMES), None, "", ""),
     ],
 )
 def test_photos_without_cameras_that_can_be_trusted(first, second, left, said):

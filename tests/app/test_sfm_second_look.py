@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from solved_cameras import solved
 
 from kgs.app.sfm import agree, second_look
 from kgs.app.sfm.leave_out import doubtful
-from kgs.app.sfm.map import Cameras
 from kgs.app.sfm.second_look import look_again
 
 PHOTOS = list("abcdef")
@@ -19,9 +19,7 @@ MATCHES = {pair: 100 + 10 * i for i, pair in enumerate(combinations(NAMES, 2))} 
 
 def cameras(photos=PHOTOS, points=90, **others):
     """Cameras of these photos, which see so many points but for those in `others`."""
-    counts = dict.fromkeys(photos, points) | others
-    rotations = dict.fromkeys(photos, np.eye(3))
-    return Cameras(dict.fromkeys(photos, 800.0), rotations, dict.fromkeys(photos, np.zeros(3)), counts, None, 0.1)
+    return solved(photos, dict.fromkeys(photos, points) | others)
 
 
 @pytest.fixture
