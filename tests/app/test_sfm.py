@@ -190,8 +190,8 @@ def mixed(tmp_path_factory):
     images = list(small_planes())
     images[1] = np.rot90(images[1])
     folder = write_planes(root / "photos", images)
-    blocks = np.random.default_rng(0).integers(0, 255, (12, 16, 3), dtype=np.uint8)
-    cv2.imwrite(str(folder / "IMG_4.png"), cv2.resize(blocks, SMALL, interpolation=cv2.INTER_CUBIC))
+    other = cv2.circle(np.full((*SMALL[::-1], 3), 128, np.uint8), (80, 60), 20, (0, 0, 255), -1)
+    cv2.imwrite(str(folder / "IMG_4.png"), other)
     mask = np.full(SMALL[::-1], 255, np.uint8)
     mask[:, :HIDDEN] = 0
     write_planes(folder / "masks", [mask, np.rot90(mask), np.full(SMALL[::-1], 255, np.uint8)])
