@@ -44,10 +44,14 @@ def test_auto_is_numba_where_it_is_installed_and_the_device_is_a_cpu(installed):
     assert [backends.resolve(name, cpu) for name in ("torch", "numba")] == ["torch", "numba"]
     with pytest.raises(ValueError, match='backend: expected "auto" or "torch" on cuda, got "numba"'):
         backends.resolve("numba", gpu)
+    former = [backends.former_or_auto(name, cpu) for name in ("numba", "torch", "triton")]
+    assert former == ["numba", "torch", "auto"]
+    assert backends.former_or_auto("numba", gpu) == "auto"
     installed(False)
     assert backends.resolve("auto", cpu) == "torch"
     with pytest.raises(ModuleNotFoundError, match="numba"):
         backends.resolve("numba", cpu)
+    assert backends.former_or_auto("numba", cpu) == "auto"  # a fit is shown where its backend is not there
 
 
 @pytest.mark.parametrize(("asked", "made"), [("auto", "numba"), ("torch", "torch")])
@@ -73,11 +77,3 @@ def test_a_resumed_fit_goes_on_with_what_it_was_begun_with(installed, scene, poi
         assert (resumed.plan.backend, resumed.renderer.backend) == (begun, begun)
     with pytest.raises(DataError, match=f"backend: expected '{begun}', as the fit was begun with, got '{other}'"):
         Trainer.resume(scene, replace(CONFIG, backend=other), tmp_path / CHECKPOINT)
-
-
-def test_a_fit_is_shown_where_its_backend_is_not_there(installed):
-    cpu, gpu = torch.device("cpu"), torch.device("cuda")
-    assert [backends.former_or_auto(name, cpu) for name in ("numba", "torch", "triton")] == ["numba", "torch", "auto"]
-    assert backends.former_or_auto("numba", gpu) == "auto"
-    installed(False)
-    assert backends.former_or_auto("numba", cpu) == "auto"

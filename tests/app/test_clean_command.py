@@ -1,23 +1,10 @@
 """`kgs clean`: what it writes and says, of a finished fit, of a PLY file with cameras and of one alone."""
 
-import math
-import os
-
 import numpy as np
-import pytest
 import torch
 from command import one_line, run
 
 from kgs import GaussianModel, load_ply, save_ply
-
-FIT = ("--init", "scene", "--max-gaussians", 1000, "--steps", 30, "--no-prune")
-
-
-@pytest.fixture(scope="module")
-def fitted(folder, tmp_path_factory):
-    out = tmp_path_factory.mktemp("out") / "fit"
-    assert run("fit", folder, "-o", out, *FIT) == 0
-    return out
 
 
 def planted(path, out, offset=0.0):
@@ -96,57 +83,3 @@ def test_far_from_the_origin_positions_stay(fitted, tmp_path, capsys):
     assert len(whole) // 2 < len(cleaned) < len(whole)
     distances = torch.cdist(cleaned.means.double(), whole.means.double()).amin(1)
     np.testing.assert_allclose(distances.detach(), 0.0, atol=1e-6)
-
-
-def strays_alone(path):
-    """Needles close together, and small ones all around, far from each other."""
-    n = 20
-    angles = 2 * math.pi * torch.arange(n) / n
-    ring = torch.stack([angles.cos(), angles.sin(), 0 * angles], 1)
-    z = 1 - 2 * (torch.arange(n) + 0.5) / n
-    turns = math.pi * (1 + 5**0.5) * torch.arange(n)
-    radius = (1 - z * z).sqrt()
-    sphere = 10 * torch.stack([radius * turns.cos(), radius * turns.sin(), z], 1)
-    scales = torch.tensor([[1.0, 0.001, 0.001]]).repeat(n, 1), torch.full((n, 3), 0.01)
-    quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(2 * n, 1)
-    zeros = torch.zeros(2 * n, 1, 3)
-    model = GaussianModel(
-        torch.cat([ring, sphere]), quats, torch.cat(scales).log(), zeros[:, 0, 0], zeros, zeros[:, 1:]
-    )
-    save_ply(path, model)
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ("{splat} --strength -1", "--strength: expected"),
-        ("{missing}", "missing"),
-        ("{empty}", "empty.ply: Gaussians: expected at least one"),
-        ("{strays} --strength 100", "--strength: expected one at which a Gaussian is left"),
-        ("{scene}", "config.json"),
-        ("{fit} --cameras {scene}", "--cameras: expected a PLY file as SPLAT"),
-        ("{fit} --downscale 2", "--downscale: expected a PLY file as SPLAT"),
-        ("{splat} --downscale 2", "--downscale: expected --cameras"),
-        ("{splat} --cameras {fit}/test", "{fit}/test"),
-        ("{splat} --cameras {missing}", "missing"),
-        ("{splat} --device foo", "--device: expected"),
-        ("{scene}/transforms_train.json", "not a PLY file"),
-        ("{splat} -o {out}", "--out: expected a file that ends in .ply"),
-        ("{splat} -o {fit}/splat.ply", "--out: expected another file"),
-        ("{splat} -o {fit}/none/splat.ply", "expected a file in a folder that is there"),
-    ],
-)
-def test_mistakes_are_one_line_and_nothing_is_written(fitted, folder, tmp_path, capsys, words, said):
-    paths = {"missing": tmp_path / "missing", "scene": folder, "fit": fitted, "out": tmp_path / "out"}
-    paths |= {"splat": fitted / "splat.ply", "empty": tmp_path / "empty.ply", "strays": tmp_path / "strays.ply"}
-    strays_alone(tmp_path / "strays.ply")
-    save_ply(tmp_path / "empty.ply", load_ply(tmp_path / "strays.ply").select(torch.arange(0)))
-    before = sorted(os.listdir(tmp_path))
-    at_fit = {path: path.stat().st_mtime_ns for path in fitted.rglob("*")}
-    given = [word.format(**paths) for word in words.split()]
-    if "-o" not in given:
-        given += ["-o", str(tmp_path / "clean.ply")]
-    assert run("clean", *given) == 2
-    assert said.format(**paths) in one_line(capsys)
-    assert sorted(os.listdir(tmp_path)) == before
-    assert {path: path.stat().st_mtime_ns for path in fitted.rglob("*")} == at_fit

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import tyro
 from command import one_line, run
-from tiny_scenes import write_colmap
 
 import kgs
 from kgs._support.json_files import write_json
@@ -27,15 +26,9 @@ from kgs.app.files.publishing import UNFINISHED, replacing
 from kgs.app.files.results_folder import CHECKPOINT, PREVIOUS
 from kgs.fit.config import DETAILS, DROP, PAPER, PRESETS, FitConfig
 
+QUICK = ("--init", "scene", "--max-gaussians", 3000)
 STEPS = 30
-FIT = ("--init", "scene", "--max-gaussians", 3000)
-
-
-@pytest.fixture(scope="module")
-def fitted(folder, tmp_path_factory):
-    out = tmp_path_factory.mktemp("out")
-    assert run("fit", folder, "-o", out, "--steps", STEPS, *FIT) == 0
-    return out
+FIT = (*QUICK, "--steps", STEPS)  # of the fixture `fitted`
 
 
 def test_fit_writes_everything(fitted):
@@ -52,7 +45,7 @@ def test_fit_writes_everything(fitted):
 def test_a_fit_of_fewer_pixels_than_the_photos_have_names_detail_high(folder, tmp_path, monkeypatch, capsys):
     """Where --detail chose them; --size was a choice of the user."""
     monkeypatch.setitem(DETAILS, "low", DETAILS["low"]._replace(size=32))
-    quick = ("--steps", 2, "--evaluations", 1, *FIT)
+    quick = ("--steps", 2, "--evaluations", 1, *QUICK)
     paper = ("--preset", "paper", "--detail", "low")
     for options, expected in ((("--detail", "low"), True), (paper, False), (("--size", 32), False), ((), False)):
         assert run("fit", folder, "-o", tmp_path / "out", *options, *quick) == 0
@@ -94,8 +87,15 @@ def write_as_kgs(path, values):
         write_json(new / path.name, values)
 
 
-def test_eval_measures_the_same_and_keeps_the_rest(fitted, capsys):
-    path = fitted / "metrics.json"
+@pytest.fixture
+def copied(fitted, tmp_path):
+    """The results, for this test alone."""
+    shutil.copytree(fitted, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def test_eval_measures_the_same_and_keeps_the_rest(copied, capsys):
+    path = copied / "metrics.json"
     before = json.loads(path.read_text())
     for values in (before["test"], *before["test"]["views"], before["train"], *before["train"]["views"]):
         values |= {"lpips_vgg": 0.25, "lpips_vgg_unscaled": 0.125}
@@ -103,32 +103,26 @@ def test_eval_measures_the_same_and_keeps_the_rest(fitted, capsys):
     wrong = json.loads(json.dumps(before))
     wrong["test"]["psnr"] = wrong["train"]["views"][0]["ssim"] = 1.0
     write_as_kgs(path, wrong)
-    assert run("eval", fitted) == 0
+    assert run("eval", copied) == 0
     assert json.loads(path.read_text()) == before
     assert "PSNR" in capsys.readouterr().out
 
 
-def test_eval_refuses_a_device_that_is_not_there(fitted, capsys):
-    assert run("eval", fitted, "--device", "foo") == 2
-    assert "--device: expected" in one_line(capsys)
-
-
-def test_eval_refuses_measures_of_other_views(fitted, capsys, tmp_path):
-    shutil.copytree(fitted, tmp_path / "copy")
-    path = tmp_path / "copy" / "metrics.json"
+def test_eval_refuses_measures_of_other_views(copied, capsys):
+    path = copied / "metrics.json"
     metrics = json.loads(path.read_text())
     metrics["test"]["views"][0]["name"] = "another"
     write_as_kgs(path, metrics)
-    assert run("eval", tmp_path / "copy") == 2
+    assert run("eval", copied) == 2
     assert "has other views" in one_line(capsys)
     assert json.loads(path.read_text()) == metrics
 
 
 def test_resume_of_a_finished_fit_changes_nothing_and_with_other_numbers_is_refused(fitted, folder, capsys):
     before = (fitted / "splat.ply").read_bytes()
-    assert run("fit", folder, "-o", fitted, "--steps", STEPS, *FIT, "--resume") == 0
+    assert run("fit", folder, "-o", fitted, *FIT, "--resume") == 0
     capsys.readouterr()
-    assert run("fit", folder, "-o", fitted, "--steps", STEPS, "--seed", 1, *FIT, "--resume") == 2
+    assert run("fit", folder, "-o", fitted, *FIT, "--seed", 1, "--resume") == 2
     assert "--seed: expected 0" in one_line(capsys)
     assert (fitted / "splat.ply").read_bytes() == before
 
@@ -141,71 +135,6 @@ def test_a_fit_at_work_is_not_called_unfinished(folder, tmp_path, capsys):
         assert "another fit is at work" in one_line(capsys)
     assert run("fit", folder, "-o", tmp_path) == 2
     assert "go on with it by --resume, or remove this folder" in one_line(capsys)
-
-
-@pytest.fixture(scope="module")
-def small(tmp_path_factory):
-    """A scene whose photos are too small to be fitted."""
-    scene = tmp_path_factory.mktemp("small")
-    write_colmap(scene)
-    return scene
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ("fit {scene} -o {out} --views 99", "--views: expected"),
-        ("fit {scene} -o {out} --init file --init-file {missing}", "missing"),
-        ("fit {scene} -o {out} --max-gaussians 0", "--max-gaussians: expected"),
-        ("fit {scene} -o {out} --device cuda:99", "--device: expected"),
-        ("fit {scene} -o {scene}", "files of a scene"),
-        ("fit {scene} -o {scene}/transforms_train.json", "expected a folder for results"),
-        ("fit {scene} -o {out} --size 31", "--size: expected at least 32 pixels"),
-        ("fit {scene} -o {out} --size small", "--size: expected pixels, field"),
-        ("fit {scene} -o {out} --size images_9", "images_9"),
-        ("fit {scene} -o {out} --roll 400", "--roll: expected"),
-        ("fit {scene} -o {out} --downscale 2", "--downscale: expected at least 32 pixels, got photos"),
-        ("fit {scene} --views 3", "-o: expected a folder for the results, for example kgs fit {scene} --views 3 -o "),
-        ("fit {small} -o {out}", "{small}: images: expected at least 32 pixels"),
-        ("fit {scene} -o {out} --device gpu", "--device: expected"),
-        ("demo -o {out} --device foo", "--device: expected"),
-        ("demo -o {scene}", "files of a scene"),
-        ("eval {scene} --lpips-weights {missing}", "missing"),
-        ("render {file} --cameras {scene} -o {out} --downscale 0.5", "--downscale: expected"),
-        ("render {file} --cameras {scene} -o {scene}/train", "files of a scene"),
-        ("render {file} --cameras {scene} -o {out} --device foo", "--device: expected"),
-        ("render {file} --cameras {scene}", " -o transforms_train-render"),
-        ("page {missing} --cameras {scene} -o {scene}.html", "missing"),
-        ("fit {scene} -o ''", "--out: expected a path, got ''"),
-        ("fit {scene} -o=", "--out: expected a path, got ''"),
-        ("fit '' -o {out}", "scene: expected a path, got ''"),
-        ("fit ''", "scene: expected a path, got ''"),
-        ("fit {scene} -o {out} --masks=", "--masks: expected a path, got ''"),
-        ("fit {scene} -o {out} --masks ''", "--masks: expected a path, got ''"),
-        ("fit {scene} -o {out} --lpips-weights ''", "--lpips-weights: expected a path, got ''"),
-        ("fit {scene} -o {out} --init file --init-file ''", "--init-file: expected a path, got ''"),
-        ("demo -o ''", "--out: expected a path, got ''"),
-        ("render {file} --cameras '' -o {out}", "--cameras: expected a path, got ''"),
-        ("page '' --cameras {scene}", "ply: expected a path, got ''"),
-        ("clean {file} --out=", "--out: expected a path, got ''"),
-        ("export '' -o {out}", "ply: expected a path, got ''"),
-        ("eval ''", "out: expected a path, got ''"),
-        ("bench speed -o ''", "--out: expected a path, got ''"),
-        ("study -o ''", "--out: expected a path, got ''"),
-        ("nonsense", "one of demo, fit, render, eval, page, clean, scale, export, check, bench, study, got 'nonsense'"),
-        ("bench nonsense", "one of speed, precision, extremes, got"),
-        ("bench sped", "did you mean speed?"),
-    ],
-)
-def test_mistakes_are_one_line_and_exit_code_2(folder, small, tmp_path, capsys, words, said):
-    """Those that need the scene or torch; the others are in test_cli_process.py."""
-    paths = {"missing": tmp_path / "missing", "scene": folder, "small": small, "out": tmp_path / "out"}
-    paths["file"] = folder / "transforms_train.json"
-    before = sorted(folder.rglob("*"))
-    assert run(*(word.format(**paths) for word in shlex.split(words))) == 2
-    assert said.format(**paths) in one_line(capsys)
-    assert sorted(folder.rglob("*")) == before
-    assert os.listdir(tmp_path) == []  # nothing was begun
 
 
 def test_a_newline_in_a_folders_name_is_escaped(tmp_path, capsys):
@@ -249,8 +178,6 @@ def test_presets_and_details_are_starts_that_options_change(folder, tmp_path, mo
 @pytest.mark.parametrize(
     ("words", "preset"),
     [
-        ("--preset paper --preset=plain", "plain"),
-        ("--preset=plain --preset paper", "paper"),
         ("--preset=plain --title=--preset --preset=auto", "auto"),
         ("--preset plain -- --preset paper", "plain"),
         ("--title --preset=plain", "plain"),  # tyro refuses this one

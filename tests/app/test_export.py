@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from command import one_line, run
+from command import run
 from compressed_reader import decode
 from factories import random_model
 
 import kgs
-from kgs.app.files.publishing import is_own, replacing
+from kgs.app.files.publishing import is_own
 
 
 @pytest.fixture
@@ -40,34 +40,3 @@ def test_an_origin_makes_map_coordinates_small(tmp_path: Path) -> None:
     out = tmp_path / "map.compressed.ply"
     assert run("export", tmp_path / "map.ply", "-o", out, "--origin", 5000000, 6000000, 100) == 0
     np.testing.assert_allclose(decode(out)["means"], model.means.detach().numpy(), atol=0.01)
-
-
-@pytest.mark.parametrize("is_of_a_fit", [True, False])
-def test_another_file_of_this_name_is_refused(splat: Path, tmp_path: Path, capsys: Any, is_of_a_fit: bool) -> None:
-    """The user's, or a result of another command."""
-    if is_of_a_fit:
-        with replacing(tmp_path, "fit") as new:
-            (new / "a.ply").write_bytes(b"other")
-    else:
-        (tmp_path / "a.ply").write_bytes(b"other")
-    assert run("export", splat, "-o", tmp_path / "a.ply") == 2
-    assert "holds a.ply, which this command did not write" in one_line(capsys)
-    assert (tmp_path / "a.ply").read_bytes() == b"other"
-
-
-def test_mistakes_are_a_line_and_change_nothing(splat: Path, tmp_path: Path, capsys: Any) -> None:
-    (tmp_path / "folder.ply").mkdir()
-    kgs.save_ply(tmp_path / "none.ply", random_model(0))
-    assert run("export", splat, "-o", tmp_path / "own.ply") == 0
-    capsys.readouterr()
-    before = {path: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()}
-    for given, out, said in (
-        ("splat.ply", "a.sog", "--out: "),
-        ("splat.ply", "folder.ply", "folder.ply: "),
-        ("splat.ply", "nowhere/a.ply", "a.ply: "),
-        ("none.ply", "a.ply", "none.ply: vertex: "),
-        ("own.ply", "own.ply", "--out: "),  # the rounded file would take the place of the plain one
-    ):
-        assert run("export", tmp_path / given, "-o", tmp_path / out) == 2
-        assert said in one_line(capsys)
-    assert {path: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()} == before

@@ -146,7 +146,7 @@ def test_one_film_takes_the_place_of_the_other(fit: Fit, tmp_path: Path, monkeyp
 
 @pytest.mark.parametrize("background", ["black", "white"])
 def test_a_png_with_alpha_over_a_background_is_the_opaque_one(folder: Path, tmp_path: Path, background: Any) -> None:
-    points = torch.rand(300, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor([-0.5, -1.05, 1.25])
+    points = torch.rand(300, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor([-0.5, -1.25, -0.5])
     model = kgs.GaussianModel.from_points(points, torch.rand(300, 3), 0)
     with torch.no_grad():
         model.opacity_logits += 1.0

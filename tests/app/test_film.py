@@ -187,9 +187,11 @@ def suffix(request: Any) -> str:
     return f".{request.param}"
 
 
-@pytest.mark.parametrize(("size", "expected"), [((33, 45), (32, 44)), ((1400, 2100), (1280, 1920))])
-def test_the_frames_are_the_renders(tmp_path: Path, monkeypatch: Any, suffix: str, size: Any, expected: Any) -> None:
-    monkeypatch.setattr(film, "FRAMES", 8)
+@pytest.mark.parametrize(("count", "size", "expected"), [(8, (33, 45), (32, 44)), (3, (1400, 2100), (1280, 1920))])
+def test_the_frames_are_the_renders(
+    tmp_path: Path, monkeypatch: Any, suffix: str, count: int, size: Any, expected: Any
+) -> None:
+    monkeypatch.setattr(film, "FRAMES", count)
     monkeypatch.setattr(encoders, "BITS", 2.0)
     rendered = []
 
@@ -203,7 +205,7 @@ def test_the_frames_are_the_renders(tmp_path: Path, monkeypatch: Any, suffix: st
     video, frames = cv2.VideoCapture(str(path)), []
     while (found := video.read())[0]:
         frames.append(torch.from_numpy(np.ascontiguousarray(found[1][:, :, ::-1])).permute(2, 0, 1) / 255)
-    assert len(frames) == 8
+    assert len(frames) == count
     assert tuple(frames[0].shape[1:]) == expected
     assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(24)
     for frame, image in zip(frames, rendered, strict=True):

@@ -212,7 +212,7 @@ def test_the_splat_on_the_page_changes_and_the_eye_does_not(scene: Any, tmp_path
         return step(self)
 
     monkeypatch.setattr(Trainer, "_optimize", when_allowed)
-    config = replace(CONFIG, steps=200)
+    config = replace(CONFIG, steps=60)
     arguments = (scene, config, tmp_path / "out", SceneRequest("/photos", 3))
     fit = Thread(target=lambda: app.fit_folder(*arguments, live=True, say=lines.append), daemon=True)
     with Browser(tmp_path / "chromium") as browser:
@@ -224,7 +224,7 @@ def test_the_splat_on_the_page_changes_and_the_eye_does_not(scene: Any, tmp_path
         assert url
         browser.open(url[0], "window.viewer && viewer.renderer.splat.count > 0")
         assert browser.run("viewer.tour") is None  # which would take the time of the fit
-        assert browser.run(TEXT) == "step 0 of 200, 150 Gaussians"
+        assert browser.run(TEXT) == "step 0 of 60, 150 Gaussians"
         browser.run("viewer.turn(0.1, 0.05)")
         eye = browser.run("JSON.stringify(viewer.eye)")
         first = browser.run(DRAWN)

@@ -23,11 +23,12 @@ OTHER_PATHS += ("/../../../../etc/passwd", "/%2e%2e/etc/passwd", "/?", "/favicon
 
 
 @pytest.fixture
-def server() -> Iterator[LiveServer]:
+def server(monkeypatch: Any) -> Iterator[LiveServer]:
     server = LiveServer(lambda: b"<p>a page")
     server.show("step 0", lambda: SPLAT)
     yield server
     if server._thread.is_alive():
+        monkeypatch.setattr(live_server, "_GRACE", 0.0)
         server.close("over")
 
 
@@ -59,7 +60,7 @@ def waiting(server: LiveServer, after: int) -> tuple[Thread, list[tuple[dict[str
 
 
 def test_the_page_and_the_splat(server: LiveServer) -> None:
-    code, head, body = ask(server)
+    code, head, body = ask(server, host=f"localhost:{server.port}")
     assert (code, body) == (200, b"<p>a page")
     assert "content-type: text/html; charset=utf-8" in head
     assert f"content-length: {len(body)}" in head
@@ -90,34 +91,27 @@ def test_what_is_not_there_yet_is_waited_for(server: LiveServer, monkeypatch: An
     assert (code, body) == (204, b"")
 
 
-def test_localhost_names_it_as_well(server: LiveServer) -> None:
-    assert ask(server, host=f"localhost:{server.port}")[0] == 200
+REFUSED = [
+    *((f"GET {path}", host, 403) for path in ("/", "/splat?after=0") for host in OTHER_HOSTS),
+    *((f"GET {path}", "localhost:{}", 404) for path in OTHER_PATHS),
+    *((f"{method} /", None, 501) for method in ("POST", "PUT", "DELETE", "OPTIONS", "CONNECT", "TRACE", "get")),
+]
+SAID = {403: b"Forbidden", 404: b"Not Found", 501: b"Not Implemented"}
 
 
-@pytest.mark.parametrize("path", ["/", "/splat?after=0"])
-@pytest.mark.parametrize("host", OTHER_HOSTS)
-def test_other_hosts_are_refused(server: LiveServer, host: str, path: str) -> None:
-    code, _, body = ask(server, f"GET {path}", host=host.format(server.port))
-    assert (code, body) == (403, b"Forbidden")
+@pytest.mark.parametrize(("words", "host", "expected"), REFUSED)
+def test_other_hosts_paths_and_methods_are_refused(
+    server: LiveServer, words: str, host: str | None, expected: int
+) -> None:
+    code, head, body = ask(server, words, host=host and host.format(server.port))
+    assert (code, body) == (expected, SAID[expected])
+    assert "content-type: text/plain" in head
 
 
 def test_a_request_without_a_host_is_refused(server: LiveServer) -> None:
     with socket.create_connection(("127.0.0.1", server.port), timeout=20) as connection:
         connection.sendall(b"GET / HTTP/1.0\r\n\r\n")
         assert b" 403 " in connection.recv(100)
-
-
-@pytest.mark.parametrize("path", OTHER_PATHS)
-def test_other_paths_are_not_found(server: LiveServer, path: str) -> None:
-    code, head, body = ask(server, f"GET {path}")
-    assert (code, body) == (404, b"Not Found")
-    assert "content-type: text/plain" in head
-
-
-@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "CONNECT", "TRACE", "get"])
-def test_other_methods_are_refused(server: LiveServer, method: str) -> None:
-    code, _, body = ask(server, f"{method} /")
-    assert (code, body) == (501, b"Not Implemented")
 
 
 @pytest.mark.parametrize("path", ["/", "/splat?after=0"])

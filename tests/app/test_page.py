@@ -113,12 +113,8 @@ def test_without_thumbnails_the_strip_has_numbers(tmp_path: Path) -> None:
     assert [NAMES[int(camera)] for camera, _ in shown] == sorted(NAMES)
 
 
-def test_a_title_is_no_path(tmp_path: Path) -> None:
-    write_page(tmp_path / "a.html", content(title="~1900 house, front/back"))
-    assert "<title>~1900 house, front/back</title>" in (tmp_path / "a.html").read_text(encoding="utf-8")
-
-
-def test_names_that_are_no_utf8_are_shown_with_escapes(tmp_path: Path) -> None:
+def test_a_title_is_no_path_and_names_that_are_no_utf8_are_shown_with_escapes(tmp_path: Path) -> None:
+    assert "<title>~1900 house, front/back</title>" in write(tmp_path / "a.html", title="~1900 house, front/back")
     page = content(title="\udce9t\udce9")
     page = replace(page, photos=replace(page.photos, names=["\udcff.jpg", "b", "c"]))
     write_page(tmp_path / "a.html", page)

@@ -105,11 +105,8 @@ def test_what_is_changed_is_refused_before_any_work(out: Path) -> None:
     assert contents(out) == NEW | {"test/1.txt": "mine", "notes.txt": "mine"}
 
 
-@pytest.mark.parametrize("kind", ["page", "fit"])
-def test_results_of_another_command_are_refused(out: Path, kind: str) -> None:
-    with refused("a.txt"):
-        check_free(out, kind, ["a.txt"])
-    replace_all(out, {"c.txt": "new"}, kind)
+def test_results_of_another_command_stay(out: Path) -> None:
+    replace_all(out, {"c.txt": "new"}, "page")
     assert contents(out) == OLD | {"c.txt": "new"}
 
 
@@ -210,14 +207,6 @@ def test_commands_in_one_folder_lose_no_entries(tmp_path: Path) -> None:
     assert [process.wait() for process in processes] == [0, 0, 0]
     assert sorted(map(len, read_marker(tmp_path).values())) == [20, 40]
     assert not [path for path in tmp_path.iterdir() if path.is_dir()]
-
-
-def test_a_folder_at_work_is_not_removed(tmp_path: Path) -> None:
-    with replacing(tmp_path, "page") as outer:
-        with replacing(tmp_path, "page") as inner:
-            write(inner, {"b.html": "new"})
-        write(outer, {"a.html": "new"})
-    assert contents(tmp_path) == {"a.html": "new", "b.html": "new"}
 
 
 def test_what_the_user_has_in_an_unfinished_folder_stays(tmp_path: Path) -> None:
@@ -389,11 +378,13 @@ def kill(error: BaseException, *_: Any, **__: Any) -> None:
     raise error
 
 
-def test_where_there_are_no_locks_no_folder_is_taken_for_an_abandoned_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("has_locks", [True, False])
+def test_a_folder_at_work_is_not_taken_for_an_abandoned_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_locks: bool
 ) -> None:
-    pytest.importorskip("fcntl")
-    monkeypatch.setattr("fcntl.flock", partial(kill, OSError(errno.ENOLCK, "No locks available")))
+    if not has_locks:
+        pytest.importorskip("fcntl")
+        monkeypatch.setattr("fcntl.flock", partial(kill, OSError(errno.ENOLCK, "No locks available")))
     with replacing(tmp_path, "page") as outer:
         with replacing(tmp_path, "page") as inner:
             write(inner, {"b.html": "new"})
@@ -410,16 +401,41 @@ def test_a_damaged_move_removes_nothing(out: Path, move: Any) -> None:
 
 
 @pytest.mark.parametrize("name", ["speed", "precision", "extremes"])
-def test_benchmarks_follow_the_same_rules(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_benchmarks_follow_the_same_rules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.setattr(f"kgs.bench.{name}.{name}", lambda out, **_: (out / f"{name}.md").write_text("new") and 0)
     out = tmp_path / "new"
     for _ in range(2):
         assert run("bench", name, "-o", out) == 0
     assert contents(out) == {f"{name}.md": "new"}
-    (out / f"{name}.md").write_text("mine")
-    capsys.readouterr()
-    assert run("bench", name, "-o", out) == 2
-    assert f"holds {name}.md, which this command did not write" in one_line(capsys)
-    assert contents(out) == {f"{name}.md": "mine"}
+
+
+BY = "--by 0,0,0 1,0,0 2"
+
+
+@pytest.mark.parametrize("is_of_another_command", [False, True])
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        ("fit {scene} -o {out}", "splat.ply"),
+        ("demo -o {out} --size 24 32", "splat.ply"),
+        ("export {fit}/splat.ply -o {out}/a.ply", "a.ply"),
+        ("clean {fit}/splat.ply -o {out}/a.ply", "a.ply"),
+        (f"scale {{fit}}/splat.ply {BY} -o {{out}}/a.ply", "a.ply"),
+        (f"scale {{fit}} {BY} -o {{out}}", "splat.ply"),
+        ("page {fit}/splat.ply --cameras {scene} -o {out}/a.html", "a.html"),
+        ("render {fit}/splat.ply --cameras {scene} -o {out}", "train_r_0.png"),
+        *((f"bench {name} -o {{out}}", f"{name}.md") for name in ("speed", "precision", "extremes")),
+    ],
+)
+def test_no_command_replaces_a_file_of_the_user_or_of_another_command(
+    folder: Path, fitted: Path, tmp_path: Path, capsys: Any, words: str, name: str, is_of_another_command: bool
+) -> None:
+    if is_of_another_command:
+        with replacing(tmp_path, "other") as new:
+            write(new, {name: "mine"})
+    else:
+        write(tmp_path, {name: "mine"})
+    given = [word.format(scene=folder, fit=fitted, out=tmp_path) for word in words.split()]
+    assert run(*given) == 2
+    assert f"holds {name}, which this command did not write" in one_line(capsys)
+    assert contents(tmp_path) == {name: "mine"}

@@ -11,23 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from command import one_line, run
+from command import run
 from factories import as_model, random_gaussians
 
 import kgs
 from kgs.app.files.publishing import is_own
 
-FIT = ("--init", "scene", "--max-gaussians", 300, "--steps", 3, "--evaluations", 1)
 A = "-1,2,0.5"
 B = "1,2,0.5"  # two units away
 LENGTH = 5
-
-
-@pytest.fixture(scope="module")
-def fitted(folder: Path, tmp_path_factory: Any) -> Path:
-    out: Path = tmp_path_factory.mktemp("fitted")
-    assert run("fit", folder, "-o", out, *FIT) == 0
-    return out
 
 
 @pytest.fixture(scope="module")
@@ -87,44 +79,3 @@ def test_a_splat_far_from_the_origin_keeps_its_digits(tmp_path: Path) -> None:
     after = kgs.load_ply(tmp_path / "b.ply", origin=2 * far)
     torch.testing.assert_close(after.means, 2 * gaussians.means, rtol=0, atol=1e-5)
     torch.testing.assert_close(after().scales, 2 * gaussians.scales)
-
-
-@pytest.mark.parametrize(
-    "by",
-    [
-        ("1,2", B, 1),
-        (A, "1,2,x", 1),
-        (A, "1,2,nan", 1),
-        (A, "-1.0,2,0.50", 1),  # the same point twice
-        (A, "-1,2,0.50001", 1e308),
-        (A, B, 0),
-        (A, B, -2),
-        (A, B, "inf"),
-    ],
-)
-def test_two_points_and_a_length_are_needed(fitted: Path, tmp_path: Path, by: Any, capsys: Any) -> None:
-    assert run("scale", fitted, "--by", *by, "-o", tmp_path / "out") == 2
-    assert "--by: " in one_line(capsys)
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_file_of_the_user_is_refused(fitted: Path, tmp_path: Path, capsys: Any) -> None:
-    for splat, out in ((fitted, tmp_path), (fitted / "splat.ply", tmp_path / "splat.ply")):
-        (tmp_path / "splat.ply").write_text("mine")
-        assert run("scale", splat, "--by", A, B, LENGTH, "-o", out) == 2
-        assert "holds splat.ply, which this command did not write" in one_line(capsys)
-        assert (tmp_path / "splat.ply").read_text() == "mine"
-
-
-def test_what_is_read_is_not_overwritten(fitted: Path, tmp_path: Path, capsys: Any) -> None:
-    by = ("--by", A, B, LENGTH)
-    for splat, out, field in (
-        (fitted, fitted, str(fitted)),  # which has the fit that goes on from its checkpoint
-        (tmp_path, tmp_path / "out", "config.json"),
-        (fitted / "splat.ply", tmp_path / "out", "--out"),
-        (fitted / "splat.ply", tmp_path / "none" / "splat.ply", "none"),
-        (fitted / "splat.ply", fitted / "splat.ply", "--out"),
-    ):
-        assert run("scale", splat, *by, "-o", out) == 2
-        assert field in one_line(capsys)
-    assert not list(tmp_path.iterdir())

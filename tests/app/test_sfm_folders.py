@@ -13,7 +13,7 @@ import torch
 from command import run as command
 from init_point_scenes import cameras, texture
 from limits import limited
-from photo_folders import close, planes, write_photos, write_planes
+from photo_folders import close, exif, planes, with_exif, write_photos, write_planes
 
 from kgs._support.errors import DataError
 from kgs._support.progress import silent
@@ -79,6 +79,7 @@ FOLDERS = {  # what is in them, and what is said of it
         ("1 of 4 photos cannot be read (raw.dng)", "sips", "magick", "Most Compatible"),
     ),
     "video called JPEG": (lambda at: save(at, planes(), z_jpg=VIDEO), ("z.jpg: is a HEIC photo or a video", "sips")),
+    "empty": (lambda at: save(at, planes(), z_jpg=b""), ("z.jpg: expected an image, got an empty file",)),
     "videos": (
         lambda at: save(at, [], clip_MOV=VIDEO, other_mp4=VIDEO),
         ("several videos (clip.MOV, other.mp4): name one",),
@@ -176,11 +177,6 @@ def test_what_looks_like_a_photo_and_is_not_taken_is_named(folder, refused):
         assert name not in said
 
 
-def test_an_empty_file_is_named(folder, refused):
-    save(folder, planes(), z_jpg=b"")
-    refused(folder, "z.jpg: expected an image, got an empty file")
-
-
 @pytest.mark.parametrize("name", ["0_mask.png", "0.png.png", "mask_0.PNG", "Masks/0.png", "masks/0-mask.png"])
 def test_masks_beside_photos_are_used_and_no_photos(folder, name):
     save(folder, planes())
@@ -193,6 +189,44 @@ def test_masks_beside_photos_are_used_and_no_photos(folder, name):
     np.testing.assert_array_equal(photos[0].mask, mask)
     assert photos[1].mask is None
     assert not notes_on(folder)
+
+
+@pytest.mark.parametrize("stored", [False, True])
+def test_a_mask_is_upright_or_as_the_photo_is_stored(tmp_path, stored):
+    """Of a photo that its Exif turns by 90 degrees."""
+    upright = planes()[0]
+    jpeg = cv2.imencode(".jpg", np.rot90(upright))[1].tobytes()
+    (tmp_path / "a.jpg").write_bytes(with_exif(jpeg, exif(orientation=6)))
+    (tmp_path / "masks").mkdir()
+    mask = np.full((180, 240), 255, np.uint8)
+    mask[:, :40] = 0
+    cv2.imwrite(str(tmp_path / "masks" / "a.png"), np.rot90(mask) if stored else mask)
+    (photo,) = read_photos(open_photos([tmp_path / "a.jpg"], tmp_path / "masks"), silent)
+    assert photo.size == (240, 180)
+    assert np.array_equal(photo.mask, mask)
+
+
+@pytest.mark.parametrize("kind", ["alpha", "mask", "both"])
+def test_a_colour_that_is_hidden_does_not_show_in_a_reduced_photo(tmp_path, kind):
+    """One colour is seen, another is hidden: at the border only the first one shows."""
+    height, width = 1700, 1900
+    y, x = np.mgrid[:height, :width]
+    hidden = (np.hypot(x - 900, y - 850) < 501.3) | (x < 33)
+    image = np.where(hidden[..., None], np.uint8([0, 255, 0]), np.uint8([30, 60, 200]))
+    if kind != "mask":
+        image = np.dstack([image, np.where(hidden & (kind == "alpha") | (y > 1600), 0, 255).astype(np.uint8)])
+    cv2.imwrite(str(tmp_path / "a.png"), image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    if kind != "alpha":
+        (tmp_path / "masks").mkdir()
+        cv2.imwrite(str(tmp_path / "masks" / "a.png"), np.where(hidden, 0, 255).astype(np.uint8))
+    masks = None if kind == "alpha" else tmp_path / "masks"
+    (photo,) = read_photos(open_photos([tmp_path / "a.png"], masks), silent)
+    seen = np.ones(photo.pixels.shape[:2], bool) if photo.mask is None else photo.mask > 0
+    if not photo.is_opaque:
+        seen &= photo.pixels[..., 3] > 0
+        assert not photo.pixels[photo.pixels[..., 3] == 0].any()
+    assert 0.5 < seen.mean() < 0.95
+    assert np.abs(photo.pixels[seen][:, :3].astype(int) - [200, 60, 30]).max() <= 1
 
 
 def test_what_is_called_like_masks_and_is_not_used_is_named(folder):
@@ -235,13 +269,6 @@ def test_walking_forward(tmp_path, refused):
     images = planes(cameras(np.array([[0.02, 0.0, -0.2], [0.0, 0.02, 0.0], [-0.02, 0.0, 0.2]]), 0.01))
     text = refused(write_photos(tmp_path / "photos", images), "step sideways, not forward", "Matches of each pair")
     assert "places between" not in text
-
-
-def test_photos_that_would_be_shrunk_to_nothing(folder, refused):
-    """Told before their cameras are found."""
-    save(folder, [cv2.resize(image, (640, 480)) for image in planes()])
-    said = refused(folder, options=("--downscale", "40"))
-    assert said == "kgs: --downscale: expected 32 pixels or more of the longer side, got 16x12 of 640x480\n"
 
 
 def test_a_blurred_photo_is_told(folder):
@@ -371,6 +398,13 @@ def test_a_copy_of_the_results_goes_on(folder, tmp_path, found, lost):
     save(folder, planes()[:1, 20:], ["IMG_4.png"])
     assert not pose_photos(folder, copy)["reused"]
     assert len(list((copy / "images").iterdir())) == 4
+
+
+def test_other_masks_make_other_cameras(folder, tmp_path, found):
+    save(write_planes(folder) / "masks", [np.full((180, 240), 255, np.uint8)], ["IMG_1.png"])
+    assert [pose_photos(folder, tmp_path / "out")["reused"] for _ in range(2)] == [False, True]
+    (folder / "masks" / "IMG_1.png").unlink()
+    assert not pose_photos(folder, tmp_path / "out")["reused"]
 
 
 def test_results_that_are_lost_are_made_again_and_changed_ones_refused(folder, tmp_path, found):

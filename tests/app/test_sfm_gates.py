@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from solved_cameras import solved
 
 from kgs._support.errors import DataError
 from kgs.app.sfm import map as mapping
@@ -18,20 +19,16 @@ from kgs.app.sfm.gates import (
     weakest_link,
     why_no_cameras,
 )
-from kgs.app.sfm.map import Cameras, PairGeometry
+from kgs.app.sfm.map import PairGeometry
 
 NAMES = ["a", "b", "c"]
 PAIRS = {("a", "b"): 200, ("a", "c"): 40, ("b", "c"): 90}
 
 
 def cameras(focal=800.0, points=(90, 80, 70), turn=0.0, missing=(), rise=0.1):
-    """Three cameras in a row that look along z, the last turned by so many degrees about y."""
-    turns = dict(zip(NAMES, (0.0, 0.0, turn), strict=True))
-    rotations = {n: cv2.Rodrigues(np.array([0.0, np.radians(t), 0.0]))[0] for n, t in turns.items()}
-    centers = {n: np.array([float(i), 0, 0]) for i, n in enumerate(NAMES)}
-    counts = {n: count for n, count in zip(NAMES, points, strict=True) if n not in missing}
-    rows = ({n: v for n, v in kind.items() if n not in missing} for kind in (rotations, centers))
-    return Cameras(dict.fromkeys(NAMES, focal), *rows, counts, None, rise)
+    """Three cameras, the last turned by so many degrees about y."""
+    counts = {name: count for name, count in zip(NAMES, points, strict=True) if name not in missing}
+    return solved(counts, counts, {"c": turn}, dict.fromkeys(NAMES, focal), rise)
 
 
 @pytest.mark.parametrize(

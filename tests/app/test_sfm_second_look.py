@@ -6,12 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from photo_folders import write_planes
+from solved_cameras import solved
 
-from kgs.app.sfm import agree, pose_photos, second_look
-from kgs.app.sfm import map as mapping
+from kgs.app.sfm import agree, second_look
 from kgs.app.sfm.leave_out import doubtful
-from kgs.app.sfm.map import Cameras
 from kgs.app.sfm.second_look import look_again
 
 PHOTOS = list("abcdef")
@@ -21,9 +19,7 @@ MATCHES = {pair: 100 + 10 * i for i, pair in enumerate(combinations(NAMES, 2))} 
 
 def cameras(photos=PHOTOS, points=90, **others):
     """Cameras of these photos, which see so many points but for those in `others`."""
-    counts = dict.fromkeys(photos, points) | others
-    rotations = dict.fromkeys(photos, np.eye(3))
-    return Cameras(dict.fromkeys(photos, 800.0), rotations, dict.fromkeys(photos, np.zeros(3)), counts, None, 0.1)
+    return solved(photos, dict.fromkeys(photos, points) | others)
 
 
 @pytest.fixture
@@ -125,31 +121,3 @@ def test_the_whole_set_first_and_then_those_that_failed_look_again(monkeypatch):
                 solver not in expected for solver in ("first", "second")
             ]
             assert held == []
-
-
-def test_a_solver_whose_first_pair_leads_nowhere_registers_all_photos(tmp_path, monkeypatch):
-    pytest.importorskip("pycolmap")
-    map_once = mapping._run_mapper
-
-    def run_mapper(pycolmap, database, images, work, options, start=""):
-        fails = database.stem == "second" and options.init_image_id1 < 0
-        return None if fails else map_once(pycolmap, database, images, work, options, start)
-
-    monkeypatch.setattr(mapping, "_run_mapper", run_mapper)
-    report = pose_photos(write_planes(tmp_path / "photos"), tmp_path / "out")
-    assert len(report["photos"]) == 3
-    assert report["left_out"] == {}
-
-
-@pytest.mark.slow
-def test_six_photos_of_a_glossy_table_are_registered(tmp_path, kgs_data):
-    """Where the second solver begins with a pair from which its model collapses to three points."""
-    pytest.importorskip("pycolmap")
-    folder = kgs_data / "photos" / "headphones"
-    if not folder.is_dir():
-        pytest.skip("KGS_DATA has no photos/headphones")
-    report = pose_photos(folder, tmp_path / "out")
-    assert report["left_out"] == {}
-    assert len(report["photos"]) == 6
-    assert report["points"] > 800
-    assert report["reprojection_error_px"] < 0.5

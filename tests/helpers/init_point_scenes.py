@@ -56,7 +56,8 @@ def texture(seed: int, tint: tuple[float, float, float], size: int = 900) -> np.
 def painted_planes(posed: PinholeCamera | None = None) -> Views:
     """A reddish plane across the images of three cameras, and a bluish one before it over their upper left."""
     posed = cameras() if posed is None else posed
-    images = np.zeros((3, HEIGHT, WIDTH, 3), dtype=np.float32)
+    width, height = int(posed.width[0]), int(posed.height[0])
+    images = np.zeros((3, height, width, 3), dtype=np.float32)
     for (depth, slope), tint, seed, (left, top, side) in (
         (BACK, BACK_TINT, 1, (-6.0, -6.0, 12.0)),
         (FRONT, FRONT_TINT, 2, (-1.5, -1.2, 1.6)),
@@ -69,7 +70,7 @@ def painted_planes(posed: PinholeCamera | None = None) -> Views:
             to_world_shifted = rotation @ to_world + shift[:, None] * np.array([[0, 0, 1]])
             homography = (posed.intrinsics[i, :3, :3].numpy() @ to_world_shifted).astype(np.float64)
             cv2.warpPerspective(
-                painting, homography, (WIDTH, HEIGHT), images[i], cv2.INTER_LINEAR, cv2.BORDER_TRANSPARENT
+                painting, homography, (width, height), images[i], cv2.INTER_LINEAR, cv2.BORDER_TRANSPARENT
             )
     return as_views(posed, torch.from_numpy(images).permute(0, 3, 1, 2).contiguous())
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -11,6 +12,7 @@ from init_point_scenes import CENTERS, cameras, painted_planes
 from kornia.geometry.camera import PinholeCamera
 
 NAMES = ("IMG_1.png", "IMG_2.png", "IMG_3.png")
+SMALL = (160, 120)
 
 
 def planes(posed: PinholeCamera | None = None) -> np.ndarray:
@@ -19,24 +21,30 @@ def planes(posed: PinholeCamera | None = None) -> np.ndarray:
     return np.ascontiguousarray((images * 255).round().astype(np.uint8)[..., ::-1])
 
 
-def poses() -> np.ndarray:
-    """Their world-to-camera matrices, `(3, 4, 4)`."""
-    return cameras().extrinsics.numpy()
+def small_cameras() -> PinholeCamera:
+    """Of the smallest photos whose cameras are found, which takes a second; farther apart than `cameras()`."""
+    return cameras(1.5 * CENTERS, -0.075, SMALL)
 
 
-def write_planes(folder: Path) -> Path:
+def small_planes() -> np.ndarray:
+    """What they see."""
+    return planes(small_cameras())
+
+
+def write_planes(folder: Path, images: np.ndarray | None = None) -> Path:
+    """PNGs of `planes()`, or of other images."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name, image in zip(NAMES, planes(), strict=True):
+    for name, image in zip(NAMES, planes() if images is None else images, strict=True):
         cv2.imwrite(str(folder / name), image)
     return folder
 
 
-def write_photos(folder: Path, images: np.ndarray, film: int = 0) -> Path:
-    """JPEGs of these; `film`: the focal length that Exif says, in mm of 35 mm film (0: none)."""
-    folder.mkdir(parents=True)
-    for name, image in zip(NAMES, images, strict=True):
+def write_photos(folder: Path, images: Sequence[np.ndarray], films: Sequence[int] = ()) -> Path:
+    """JPEGs of these; `films`: the focal length that the Exif of each says, in mm of 35 mm film (0: none)."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for i, (image, film) in enumerate(zip(images, films or [0] * len(images), strict=True), 1):
         data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
-        (folder / name.replace("png", "jpg")).write_bytes(with_exif(data, exif(film=film)))
+        (folder / f"IMG_{i}.jpg").write_bytes(with_exif(data, exif(film=film)))
     return folder
 
 

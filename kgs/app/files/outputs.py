@@ -41,7 +41,7 @@ def check_folder(out: Path, scene: Path | None = None, make: bool = True) -> Non
     has_photos = inside and there == out and not is_own(out, *(path.name for path in list_images(out)))
     of_photos = ("sparse",) if (out / CAMERAS_REPORT).exists() else ()  # kgs wrote it: cameras that a former run found
     if has_photos or any((out / name).exists() for name in _SCENES if name not in of_photos):
-        raise DataError(out, "", "holds photos or files of a scene: choose a new folder for the results")
+        raise DataError(out, "", "holds photos or files of a scene: choose another folder for the results")
     if make:
         out.mkdir(parents=True, exist_ok=True)
 
