@@ -132,21 +132,6 @@ def test_the_presets_of_the_paper_have_none(exposed):
         assert decide(make_plan(exposed, config), choose_points(exposed, config)).decisions.exposure is None
 
 
-def test_resumed_is_bit_identical(exposed, tmp_path):
-    points = choose_points(exposed, CONFIG)
-    config = replace(CONFIG, steps=20)
-    plan = decide(make_plan(exposed, config), points)
-    whole = Trainer(exposed, plan, points)
-    whole.fit()
-    begun = Trainer(exposed, plan, points)
-    begun.fit(lambda trainer, _: trainer.step == 10)
-    begun.save(tmp_path / "checkpoint")
-    resumed = Trainer.resume(exposed, config, tmp_path / "checkpoint")
-    resumed.fit()
-    for name, value in whole.model.named_parameters():
-        assert torch.equal(value, resumed.model.get_parameter(name)), name
-
-
 def test_gains_of_another_number_of_photos_are_refused(arc):
     with pytest.raises(ValueError, match="gains"):
         with_exposure(arc, Decisions(exposure=ExposureDecision([[1.0, 1.0, 1.0]], 0.1, 500)))
