@@ -103,7 +103,7 @@ def test_a_trainer_whose_plan_is_open_drops_in_a_fit_of_the_usual_length(scene, 
 
 def test_a_whole_fit_says_what_it_decided():
     """Eight photos of the room, all of which show most patches."""
-    large = synthetic_scene("room", train_views=8, test_views=1, size=(96, 128))
+    large = synthetic_scene("room", train_views=8, test_views=1, size=(72, 96))
     fit = fit_scene(large, FitConfig(steps=4, evaluations=1))
     found = fit.decisions.overlap
     assert 3 <= found.views_per_pair <= found.views_per_patch <= 8
