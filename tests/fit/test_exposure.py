@@ -161,6 +161,17 @@ def test_what_is_seen_through_a_photo_has_no_exposure():
             torch.testing.assert_close(view.image, surface[:1] * gain + (1 - alpha[:1]) * color[:, None, None])
 
 
+def test_a_render_is_clamped_to_one_as_torch_clamps_it(scene):
+    target = targets(scene.train, torch.zeros(3), torch.device("cpu"))[0]
+    values = torch.tensor([-0.5, 0.0, 1.0 - 2.0**-24, 1.0, 1.0 + 2.0**-23, 3.0])
+    render = values.repeat(16).view(1, 3, 4, 8).requires_grad_()
+    weights = torch.arange(96.0).view(1, 3, 4, 8)
+    seen, clamped = target.as_photographed(render), render.clamp(max=1.0)
+    assert torch.equal(seen, clamped)
+    gradients = [torch.autograd.grad((image * weights).sum(), render)[0] for image in (seen, clamped)]
+    assert torch.equal(*gradients)
+
+
 GAIN = torch.tensor([0.8, 0.7, 1.2])
 
 

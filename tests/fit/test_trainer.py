@@ -53,29 +53,24 @@ def test_a_fit_has_the_same_bits_on_any_number_of_threads(set_threads, scene):
     assert_same_bits(*trainers)
 
 
-@pytest.mark.slow
-def test_opacities_decay_or_are_reset_when_the_schedule_says(scene, points, monkeypatch):
+DECAYED = Recipe(opacity_decay=0.9, decay_from=0.5)
+RESETS = Recipe(prune_opacity=0.005, opacity_decay=1.0, reset_interval=3000, reset_recovery=5)
+
+
+@pytest.mark.parametrize(
+    ("recipe", "name", "value", "steps"),
+    [
+        (DECAYED, "decay_opacity", 0.9, range(16, 30)),  # the last step only looks
+        (RESETS, "reset_opacity", RESETS.reset_opacity, (9, 18)),
+    ],
+)
+def test_opacities_decay_or_are_reset_when_the_schedule_says(scene, points, monkeypatch, recipe, name, value, steps):
     done = []
-
-    def note(name):
-        plain = getattr(Densifier, name)
-
-        def noted(self, value):
-            done.append((name, trainer.step, value))
-            return plain(self, value)
-
-        monkeypatch.setattr(Densifier, name, noted)
-
-    for name in ("decay_opacity", "reset_opacity"):
-        note(name)
-    trainer = begun(scene, points, recipe=Recipe(opacity_decay=0.9, decay_from=0.5))
-    trainer.fit()
-    assert done == [("decay_opacity", step, 0.9) for step in range(16, 30)]  # the last step only looks
-    done.clear()
-    recipe = Recipe(prune_opacity=0.005, opacity_decay=1.0, reset_interval=3000, reset_recovery=5)
+    for method in ("decay_opacity", "reset_opacity"):
+        monkeypatch.setattr(Densifier, method, lambda _, given, of=method: done.append((of, trainer.step, given)))
     trainer = begun(scene, points, recipe=recipe)
     trainer.fit()
-    assert done == [("reset_opacity", step, recipe.reset_opacity) for step in (9, 18)]
+    assert done == [(name, step, value) for step in steps]
 
 
 def test_harmonics_come_one_degree_after_the_other(scene, points):
@@ -114,12 +109,6 @@ def test_test_views_never_matter(whole, scene, points):
     without = fitted(replace(scene, test=scene.test.select([])), points)
     assert_same_bits(whole, without)
     assert without.state.curve[-1]["test_psnr"] is None
-
-
-def test_evaluation_uses_all_gaussians(whole, scene):
-    camera = scene.test.camera(0)
-    assert torch.equal(whole.render(camera), whole.render(camera))
-    assert whole.renderer.training
 
 
 def test_a_limit_that_leaves_no_room_holds_and_is_said_once(scene, points):
@@ -224,14 +213,14 @@ def test_the_memory_budget_reaches_the_renderer(scene, points):
         small.fit()
 
 
-def test_the_drop_rate_rises_to_the_end_and_nothing_is_dropped_in_the_last_tenth(scene, points):
+def test_the_drop_rate_rises_to_the_end_and_renders_and_the_last_tenth_drop_nothing(scene, points):
     trainer = begun(scene, points, steps=20, evaluations=1)
     rates, active = [], []
 
     def note(trainer, _):
         rates.append(trainer.state.drop.rate)
         active.append(trainer.state.drop.training)
-        trainer.render(scene.train.camera(0))  # which draws all Gaussians, and may not change this
+        assert torch.equal(*(trainer.render(scene.train.camera(0)) for _ in range(2)))  # of all Gaussians
 
     trainer.fit(note)
     assert rates == pytest.approx([0.3 * step / 20 for step in range(1, 21)])

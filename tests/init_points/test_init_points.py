@@ -44,7 +44,7 @@ def depth_errors(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.minimum(to_back, to_front), to_front < to_back
 
 
-def test_sift_points_lie_on_the_planes(sift_points: InitialPoints) -> None:
+def test_sift_points_lie_on_the_planes_and_have_their_colours(sift_points: InitialPoints) -> None:
     errors, front = depth_errors(sift_points.points)
     assert sift_points.kind == "sift"
     assert sift_points.points.dtype == torch.float32
@@ -52,17 +52,10 @@ def test_sift_points_lie_on_the_planes(sift_points: InitialPoints) -> None:
     assert min(int(front.sum()), int((~front).sum())) > 50
     assert float(errors.median()) < 0.005
     assert float((errors < 0.03).double().mean()) > 0.97
-
-
-def test_sift_points_have_no_bias_in_depth(sift_points: InitialPoints) -> None:
     x, _, z = sift_points.points.double().unbind(1)
-    for depth, slope in (BACK, FRONT):
+    for depth, slope in (BACK, FRONT):  # without a bias
         ratio = z / (depth + slope * x)
         assert abs(float(ratio[(ratio - 1).abs() < 0.03].median()) - 1) < 0.002
-
-
-def test_sift_colors_are_those_of_the_planes(sift_points: InitialPoints) -> None:
-    _, front = depth_errors(sift_points.points)
     for chosen, tint in ((front, FRONT_TINT), (~front, BACK_TINT)):
         shades = sift_points.colors[chosen] / sift_points.colors[chosen].sum(1, keepdim=True)
         expected = torch.tensor(tint) / sum(tint)
@@ -70,7 +63,7 @@ def test_sift_colors_are_those_of_the_planes(sift_points: InitialPoints) -> None
     assert float(sift_points.colors.std(0).min()) > 0.05
 
 
-def test_the_same_bits_again_for_any_number_of_threads(planes: Views) -> None:
+def test_sift_points_have_the_same_bits_on_any_number_of_threads_and_for_any_seed(planes: Views) -> None:
     count = cv2.getNumThreads()
     small = planes.downsample(2)
 
@@ -205,19 +198,15 @@ def test_typical_depths_are_the_first_percentile_and_the_median() -> None:
     assert typical_depths(points[torch.randperm(101)], views.cameras) == pytest.approx((3.0, 52.0), rel=1e-6)
     behind_and_beside = torch.tensor([[0.0, 0.0, -5.0], [50.0, 0.0, 0.001]]).repeat(50, 1)
     assert typical_depths(torch.cat([points, behind_and_beside]), views.cameras) == pytest.approx((3.0, 52.0), rel=1e-6)
-
-
-@pytest.mark.parametrize("points", [torch.zeros(0, 3), torch.tensor([[0.0, 0.0, -1.0]])])
-def test_typical_depths_without_points_before_a_camera(points: torch.Tensor) -> None:
-    assert typical_depths(points, flat().cameras) == (1.0, 1.0)
+    for none_before_a_camera in (torch.zeros(0, 3), torch.tensor([[0.0, 0.0, -1.0]])):
+        assert typical_depths(none_before_a_camera, views.cameras) == (1.0, 1.0)
 
 
 def test_a_point_without_neighbours_goes(monkeypatch: pytest.MonkeyPatch) -> None:
     wall = torch.rand(80, 3, generator=torch.Generator().manual_seed(1)) * 2 + torch.tensor([-1.0, -1.0, 5.0])
     alone = torch.tensor([[0.2, 0.1, 3.2]])
     monkeypatch.setattr("kgs.init_points.depth_limits.find_tracks", lambda *_: exact_tracks(torch.cat([wall, alone])))
-    posed = cameras()
-    result = initial_points(as_views(posed, torch.rand(3, 3, HEIGHT, WIDTH)), "sift")
+    result = initial_points(as_views(cameras(), torch.rand(3, 3, HEIGHT, WIDTH)), "sift")
     assert result.kind == "sift"
     torch.testing.assert_close(result.points, wall, rtol=1e-4, atol=1e-4)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from init_point_scenes import garden_from_above
@@ -15,7 +14,7 @@ from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
 from kgs.geometry import ViewGeometry, camera_centers, nearest_pixels, project_points
 from kgs.init_points import dense, initial_points
-from kgs.init_points.dense import PER_SKY, SKY, _first_of_each, _one_per_cell, dense_points, small_enough
+from kgs.init_points.dense import PER_SKY, SKY, _one_per_cell, dense_points, small_enough
 from kgs.init_points.depth_limits import MIN_SIFT, sweep_range
 from kgs.init_points.plane_sweep import FARTHEST, _neighbours, plane_count, planes_wanted, sweep_depths
 from kgs.init_points.sweep_costs import _semi_global
@@ -230,12 +229,6 @@ def test_a_spread_draw_follows_the_area_not_the_density() -> None:
     drawn = view_pixels[_one_per_cell(view_pixels.numpy(), 100)]
     assert 80 <= len(drawn) <= 100
     assert float((drawn[:, 1] < 10).double().mean()) < 0.25
-
-
-def test_the_first_of_each_cell_is_that_of_numpy() -> None:
-    numbers = torch.randint(40, (200,), generator=generator()).numpy()
-    assert _first_of_each(numbers, 50).tolist() == np.unique(numbers, return_index=True)[1].tolist()
-    assert len(_first_of_each(numbers[:0], 50)) == 0
 
 
 @pytest.mark.slow
