@@ -1,10 +1,12 @@
-"""`kgs check`: what it prints, and its exit code."""
+"""`kgs check`: what it prints, and its exit code; what is refused by the benchmarks."""
 
 import pytest
 import torch
 
-from kgs import backends
+from kgs import DataError, backends
 from kgs.bench import check
+from kgs.bench.scenes import check_scenes
+from kgs.bench.speed import speed
 
 
 @pytest.fixture(autouse=True)
@@ -54,3 +56,19 @@ def test_what_is_not_installed_is_no_failure(monkeypatch, capsys):
 def test_apples_gpus_are_answered_in_a_line(capsys):
     assert check.check(device="mps") == 0
     assert capsys.readouterr().out.startswith("kgs: Apple's GPUs have no Triton")
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "call"),
+    [
+        ("device", ValueError, lambda _: check.check(device="nothing")),
+        ("device", ValueError, lambda folder: speed(out=folder / "new", device="gpu9")),
+        ("{}: llff/fern", DataError, lambda folder: check_scenes(folder, ["llff/fern"])),
+    ],
+)
+def test_what_is_wrong_is_named_before_anything_is_made(name, kind, call, tmp_path):
+    with pytest.raises(kind) as error:
+        call(tmp_path)
+    assert type(error.value) is kind
+    assert str(error.value).startswith(f"{name.format(tmp_path)}: ")
+    assert not list(tmp_path.iterdir())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Literal
 
 import pytest
 import torch
@@ -201,7 +202,7 @@ def test_as_many_planes_are_wanted_as_a_picture_moves_by_pixels() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("draw", [pytest.param("uniform", marks=pytest.mark.slow), "spread"])
+@pytest.mark.parametrize("draw", ["uniform", "spread"])
 def test_few_points_are_enough_where_many_agree(draw: str) -> None:
     result = initial_points(synthetic_scene(train_views=3, size=(72, 96)).train, "dense", count=500, draw=draw)
     assert result.kind == "dense"
@@ -209,16 +210,20 @@ def test_few_points_are_enough_where_many_agree(draw: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [50, pytest.param(200, marks=pytest.mark.slow)])
-def test_a_spread_draw_has_one_point_in_each_cell(views: Views, span: tuple[float, float], count: int) -> None:
-    views = views.downsample(2)
-    spread, *_ = dense_points(views, *span, count, generator(), draw="spread")
-    uniform, *_ = dense_points(views, *span, count, generator(), draw="uniform")
-    assert 0.9 * count <= len(spread) <= count
-    assert len(uniform) <= count
-    again, other = (dense_points(views, *span, count, generator(seed), draw="spread")[0] for seed in (0, 1))
-    assert torch.equal(spread, again)
-    assert not torch.equal(spread, other)
+def test_a_spread_draw_has_one_point_in_each_cell_and_takes_all_where_there_are_fewer(
+    views: Views, span: tuple[float, float]
+) -> None:
+    def drawn(count: int, draw: Literal["spread", "uniform"], seed: int = 0) -> torch.Tensor:
+        return dense_points(views.downsample(2), *span, count, generator(seed), draw=draw)[0]
+
+    for count in (50, 200):
+        spread = drawn(count, "spread")
+        assert 0.9 * count <= len(spread) <= count
+        assert len(drawn(count, "uniform")) <= count
+    assert torch.equal(spread, drawn(200, "spread"))
+    assert not torch.equal(spread, drawn(200, "spread", seed=1))
+    every = [drawn(10**6, draw).sort(0).values for draw in ("spread", "uniform")]
+    assert torch.equal(*every)
 
 
 def test_a_spread_draw_follows_the_area_not_the_density() -> None:
@@ -229,15 +234,6 @@ def test_a_spread_draw_follows_the_area_not_the_density() -> None:
     drawn = view_pixels[_one_per_cell(view_pixels.numpy(), 100)]
     assert 80 <= len(drawn) <= 100
     assert float((drawn[:, 1] < 10).double().mean()) < 0.25
-
-
-@pytest.mark.slow
-def test_a_draw_of_more_than_there_is_takes_all(views: Views, span: tuple[float, float]) -> None:
-    every = [
-        dense_points(views.downsample(2), *span, 10**6, generator(), draw=draw)[0] for draw in ("spread", "uniform")
-    ]
-    assert len(every[0]) == len(every[1])
-    assert torch.equal(every[0].sort(0).values, every[1].sort(0).values)
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from kgs.app.scene_request import SceneRequest
 from kgs.datasets import Scene
 from kgs.fit import FitConfig
 from kgs.fit.run import choose_points
-from kgs.init_points import initial_points
+from kgs.init_points import files, initial_points
 
 
 def test_file_with_colors(tmp_path: Path) -> None:
@@ -103,23 +103,27 @@ def test_vertices_without_a_finite_position_are_no_points(tmp_path: Path) -> Non
         initial_points(flat(), "file", file=tmp_path / "cloud.ply")
 
 
-def test_a_text_is_bounded_before_it_is_read(tmp_path: Path) -> None:
+def test_a_text_is_bounded_before_it_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What reads text takes some 75 times its size; binary files of the same size are read."""
-    header = (
-        "ply\nformat {} 1.0\nelement vertex {}\n" + "".join(f"property float {x}\n" for x in "xyz") + "end_header\n"
-    )
-    count = 2**26 // 12 + 1
-    starts = {
-        "ascii.ply": header.format("ascii", count),
-        "comment.ply": header.format("ascii", count).replace("element", "comment format binary\nelement"),
-        "cloud.xyz": "0 0 0\n" * 2000,
-        "binary.ply": header.format("binary_little_endian", count),
-    }
-    for name, start in starts.items():
+    properties = "".join(f"property float {x}\n" for x in "xyz")
+    header = f"ply\nformat {{}} 1.0\nelement vertex {{}}\n{properties}end_header\n"
+
+    def write(name: str, start: str, count: int) -> Path:
         with open(tmp_path / name, "wb") as file:
             file.write(start.encode())
             file.truncate(len(start) + 12 * count)
-    for name in ("ascii.ply", "comment.ply", "cloud.xyz"):
-        with pytest.raises(DataError, match=rf"{name}: is larger than 64 MiB, the most for a text file"):
-            initial_points(flat(), "file", file=tmp_path / name)
-    assert len(initial_points(flat(), "file", file=tmp_path / "binary.ply").points) == count
+        return tmp_path / name
+
+    count = 2**26 // 12 + 1
+    text = header.format("ascii", count)
+    for path in (
+        write("ascii.ply", text, count),
+        write("comment.ply", text.replace("element", "comment format binary\nelement"), count),
+        write("cloud.xyz", "0 0 0\n" * 2000, count),
+    ):
+        with pytest.raises(DataError, match=rf"{path.name}: is larger than 64 MiB, the most for a text file"):
+            initial_points(flat(), "file", file=path)
+    monkeypatch.setattr(files, "_MAX_TEXT_BYTES", 2**16)
+    count = 2**16 // 12 + 1
+    binary = write("binary.ply", header.format("binary_little_endian", count), count)
+    assert len(initial_points(flat(), "file", file=binary).points) == count
