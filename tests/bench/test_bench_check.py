@@ -1,11 +1,12 @@
-"""`kgs check`: what it prints, and its exit code."""
+"""`kgs check`: what it prints, and its exit code; what is refused by the benchmarks."""
 
 import pytest
 import torch
 
-from kgs import Gaussians, backends
+from kgs import DataError, Gaussians, backends
 from kgs.bench import check
-from kgs.bench.scenes import gradients
+from kgs.bench.scenes import check_scenes, gradients
+from kgs.bench.speed import speed
 
 
 @pytest.fixture(autouse=True)
@@ -63,3 +64,19 @@ def test_gradients_are_taken_on_the_device_of_the_image():
     image = sum(value.sum() for value in vars(gaussians).values()).expand(1, 3, 8, 8)
     slopes = gradients(image, gaussians)
     assert {slope.device.type for slope in slopes.values()} == {"meta"}
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "call"),
+    [
+        ("device", ValueError, lambda _: check.check(device="nothing")),
+        ("device", ValueError, lambda folder: speed(out=folder / "new", device="gpu9")),
+        ("{}: llff/fern", DataError, lambda folder: check_scenes(folder, ["llff/fern"])),
+    ],
+)
+def test_what_is_wrong_is_named_before_anything_is_made(name, kind, call, tmp_path):
+    with pytest.raises(kind) as error:
+        call(tmp_path)
+    assert type(error.value) is kind
+    assert str(error.value).startswith(f"{name.format(tmp_path)}: ")
+    assert not list(tmp_path.iterdir())

@@ -11,7 +11,7 @@ from kgs import backends
 HERE = Path(__file__).parent
 
 
-def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
+def pytest_collection_modifyitems(items):
     """Mark the torch variants of the tests of fits."""
     if backends.resolve("auto", torch.device("cpu")) == "torch":
         return

@@ -118,7 +118,7 @@ def test_pose_and_lens_that_are_parameters_are_optimised_with_one_camera_object(
     one = posed(CameraModelType.PINHOLE, params, SIZE, extrinsics=pose)
     optimizer = torch.optim.Adam([params, pose], lr=0.006)
     losses = []
-    for _ in range(50):
+    for _ in range(30):
         optimizer.zero_grad()
         loss = (renderer(gaussians, one).image - target).square().mean()
         loss.backward()
@@ -130,41 +130,27 @@ def test_pose_and_lens_that_are_parameters_are_optimised_with_one_camera_object(
 # --- unusual matrices -------------------------------------------------------------------------------------------
 
 
-def changed(k, change):
-    """Intrinsics `(1, 3, 3)` or `(1, 4, 4)` that are not those of a pinhole camera."""
-    k = k.clone()
-    if change == "halved":
-        return k / 2
-    row, column, value = change
-    k[0, row, column] = value
-    return k
-
-
-@pytest.mark.parametrize("change", ["halved", (2, 2, 2.0), (2, 0, 0.1), (2, 2, math.nan), (3, 3, 0.5), (0, 3, 5.0)])
-def test_intrinsics_that_are_not_a_pinhole_cameras_are_refused(change):
-    gaussians, camera = random_gaussians(5, 0), random_camera(*SIZE, 0)
-    k = changed(camera.intrinsics, change)
-    wrong = with_camera(camera, intrinsics=k)
-    with pytest.raises(ValueError, match=r"^cameras: expected .* \(0, 0, 1\) .*first two rows"):
-        GaussianRenderer()(gaussians, wrong)
-    with pytest.raises(ValueError, match=r"^cameras: expected"):
-        kgs.project(gaussians, wrong)
-    with pytest.raises(ValueError, match=r"^camera: expected .* \(0, 0, 1\)"):
-        kgs.reference.render(gaussians, wrong)
-    with pytest.raises(ValueError, match=r"^Ks: expected .* \(0, 0, 1\)"):
-        kgs.pinhole_cameras(camera.extrinsics, k, SIZE[1], SIZE[0])
-    if not torch.equal(k[:, :3, :3], camera.intrinsics[:, :3, :3]):
-        values = [getattr(gaussians, name) for name in FIELDS]
-        with pytest.raises(ValueError, match=r"^Ks: expected .* \(0, 0, 1\)"):
-            kgs.rasterization(*values, camera.extrinsics, k[:, :3, :3], SIZE[1], SIZE[0], sh_degree=0)
-
-
-def test_intrinsics_that_change_in_place_are_checked_again():
+@pytest.mark.parametrize(
+    ("row", "column", "value"), [(2, 2, 2.0), (2, 0, 0.1), (2, 2, math.nan), (3, 3, 0.5), (0, 3, 5.0)]
+)
+def test_intrinsics_that_are_not_a_pinhole_cameras_are_refused(row, column, value):
     gaussians, camera = random_gaussians(5, 0), random_camera(*SIZE, 0)
     GaussianRenderer()(gaussians, camera)
-    camera.intrinsics.div_(2)
-    with pytest.raises(ValueError, match="^cameras: expected"):
-        GaussianRenderer()(gaussians, camera)
+    k = camera.intrinsics
+    k[0, row, column] = value  # in place, after the camera was used
+    calls = [
+        ("cameras", lambda: GaussianRenderer()(gaussians, camera)),
+        ("cameras", lambda: kgs.project(gaussians, camera)),
+        ("camera", lambda: kgs.reference.render(gaussians, camera)),
+        ("Ks", lambda: kgs.pinhole_cameras(camera.extrinsics, k, SIZE[1], SIZE[0])),
+    ]
+    if row < 3 > column:
+        values = [getattr(gaussians, name) for name in FIELDS]
+        size = (SIZE[1], SIZE[0])
+        calls.append(("Ks", lambda: kgs.rasterization(*values, camera.extrinsics, k[:, :3, :3], *size, sh_degree=0)))
+    for name, call in calls:
+        with pytest.raises(ValueError, match=rf"^{name}: expected .* \(0, 0, 1\)"):
+            call()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -303,9 +289,9 @@ def test_a_model_made_in_inference_mode_renders_there_and_outside(kind, coeffici
 
 @pytest.mark.parametrize("backend", kgs.backends.available())
 def test_a_pinhole_made_in_inference_mode_can_be_trained_with(backend):
-    gaussians = random_gaussians(40, 0, torch.float32, 1)
+    gaussians = random_gaussians(3, 0, torch.float32, 1)
     with torch.inference_mode():
-        camera = random_camera(*SIZE, 0, torch.float32)
+        camera = random_camera(8, 8, 0, torch.float32)
     leaf = gaussians.means.clone().requires_grad_()
     moved = replace(gaussians, means=leaf)
     GaussianRenderer(backend=backend)(moved, camera).image.square().sum().backward()

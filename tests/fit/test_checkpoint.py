@@ -51,15 +51,12 @@ def test_every_flipped_byte_and_every_cut_is_found(path):
     save_checkpoint(path, {"step": 3, "model": {"x": torch.arange(4.0), "y": torch.arange(3)}})
     content = path.read_bytes()
     for position in range(len(content)):
-        for mask in (1, 16, 128):
-            damaged = bytearray(content)
-            damaged[position] ^= mask
+        flipped = bytearray(content)
+        flipped[position] ^= 1 << position % 8
+        for damaged in (flipped, content[:position]):
             path.write_bytes(damaged)
             with pytest.raises(DataError, match="checkpoint"):
                 load_checkpoint(path)
-        path.write_bytes(content[:position])
-        with pytest.raises(DataError, match="checkpoint"):
-            load_checkpoint(path)
     path.write_bytes(content + b"1")
     with pytest.raises(DataError, match="checkpoint"):
         load_checkpoint(path)

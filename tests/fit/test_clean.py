@@ -147,24 +147,23 @@ def test_a_floater_that_the_photos_do_not_show_is_removed_and_the_view_gets_bett
     assert len(fit.model) == SIDE**2 + 1
 
 
-def test_a_scene_without_photos_is_refused():
-    fit = as_fit(wall())
-    views = replace(fit.scene.train, images=fit.scene.train.images.to("meta"))
-    with pytest.raises(ValueError, match="^fit: "):
-        clean(replace(fit, scene=replace(fit.scene, train=views)))
-
-
 @pytest.mark.parametrize("strength", [0.0, -1.0, math.nan, math.inf, 101.0])
 def test_a_wrong_strength_is_refused(strength):
-    with pytest.raises(ValueError, match="^strength: "):
-        find_strays(wall(), strength)
-    with pytest.raises(ValueError, match="^strength: "):
-        clean(as_fit(wall()), strength)
+    for call in (lambda: find_strays(wall(), strength), lambda: clean(as_fit(wall()), strength)):
+        with pytest.raises(ValueError, match="^strength: "):
+            call()
 
 
-def test_depths_belong_to_cameras():
-    with pytest.raises(ValueError, match="^depths: "):
-        find_strays(wall(), 1.0, views_of_a_wall().cameras, [torch.ones(SIZE)])
+def test_no_photos_too_few_depths_and_no_gaussian_left_are_refused():
+    fit = as_fit(wall())
+    without_photos = replace(fit.scene.train, images=fit.scene.train.images.to("meta"))
+    for name, call in (
+        ("fit", lambda: clean(replace(fit, scene=replace(fit.scene, train=without_photos)))),
+        ("depths", lambda: find_strays(wall(), 1.0, views_of_a_wall().cameras, [torch.ones(SIZE)])),
+        ("strength", lambda: check_left(0)),
+    ):
+        with pytest.raises(ValueError, match=f"^{name}: "):
+            call()
 
 
 @pytest.mark.parametrize("n", [0, 1, 3, 4])
@@ -173,11 +172,6 @@ def test_a_few_gaussians_in_one_place_are_no_strays(n):
     with torch.no_grad():
         model.means.copy_(torch.tensor([0.0, 0.0, 4.0]).expand(SIDE**2, 3))
     assert not bool(find_strays(model.select(torch.arange(n))).any.any())
-
-
-def test_no_gaussian_left_is_refused():
-    with pytest.raises(ValueError, match="^strength: "):
-        check_left(0)
 
 
 def test_a_camera_that_sees_no_gaussian_decides_nothing(each_backend):

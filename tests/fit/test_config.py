@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from kgs import RasterOptions
-from kgs.datasets import synthetic_scene
 from kgs.fit.config import PAPER, PRESETS, FitConfig, Recipe
 from kgs.fit.decisions import Decisions, DegreeDecision
 from kgs.fit.plan import expected_memory, gaussian_limit, make_plan, make_schedule, with_step_defaults
@@ -104,6 +103,11 @@ def test_numpys_numbers_and_paths_as_text_become_pythons():
     assert FitConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
 
 
+@pytest.mark.parametrize(("no_drop", "last"), [(0, 30), (1, 29), (3, 27), (50, 27)])  # a tenth of 30 steps is 3
+def test_nothing_is_dropped_in_the_last_steps_but_for_no_more_than_a_tenth(no_drop, last):
+    assert make_schedule(FitConfig(steps=30, no_drop_steps=no_drop)).drop == last
+
+
 def test_the_coarse_share_is_counted_in_steps():
     assert make_schedule(FitConfig(steps=2000)).coarse == 0
     assert with_step_defaults(FitConfig(), 6).coarse == 0
@@ -113,30 +117,27 @@ def test_the_coarse_share_is_counted_in_steps():
 # -- the plan ------------------------------------------------------------------------------------------------------
 
 
-SCENE = synthetic_scene(train_views=2, test_views=0, size=(16, 16))
-
-
-def test_a_plan_has_what_the_configuration_leaves_open_but_for_the_degree():
-    plan = make_plan(SCENE, FitConfig(seed=3))
-    assert plan.config == with_step_defaults(FitConfig(seed=3), 2)
+def test_a_plan_has_what_the_configuration_leaves_open_but_for_the_degree(scene):
+    plan = make_plan(scene, FitConfig(seed=3))
+    assert plan.config == with_step_defaults(FitConfig(seed=3), 3)
     assert plan.config.sh_degree is None
     assert plan.schedule == make_schedule(plan.config)
     assert (plan.device, plan.decisions) == (torch.device("cpu"), Decisions())
     assert plan.backend in ("numba", "torch")
 
 
-def test_a_degree_changes_the_schedule_and_says_why():
-    first = make_plan(SCENE, FitConfig(steps=100))
+def test_a_degree_changes_the_schedule_and_says_why(scene):
+    first = make_plan(scene, FitConfig(steps=100))
     plan = first.decided({"sh_degree": 2}, sh_degree=DegreeDecision(2, "rule"))
     assert (plan.config.sh_degree, len(plan.schedule.sh)) == (2, 2)
     assert plan.decisions.to_dict() == {"sh_degree": {"chosen": 2, "by": "rule"}}
     assert (first.config.sh_degree, first.schedule.sh, first.decisions) == (None, (), Decisions())
 
 
-def test_more_gaussians_or_pixels_take_more_memory():
-    larger = synthetic_scene(train_views=2, test_views=0, size=(32, 32))
-    assert expected_memory(SCENE, 1000) < expected_memory(SCENE, 10**6)
-    assert expected_memory(SCENE, 1000) < expected_memory(larger, 1000)
+def test_more_gaussians_or_pixels_take_more_memory(scene):
+    smaller = replace(scene, train=scene.train.downsample(2))
+    assert expected_memory(scene, 1000) < expected_memory(scene, 10**6)
+    assert expected_memory(smaller, 1000) < expected_memory(scene, 1000)
     assert gaussian_limit(FitConfig(max_gaussians=7), 100) == 7
     assert gaussian_limit(FitConfig(steps=100), 100) == 1000
     assert gaussian_limit(FitConfig(steps=100), 10_000) == 15_000

@@ -39,19 +39,15 @@ def test_what_two_pictures_hold_is_shown():
     assert not bool(_shown(wall(), rig(0.0), [wall()], rig(0.0)).any())  # one view is not enough
 
 
-def test_what_is_hidden_from_a_view_is_not_shown():
+def test_what_is_hidden_from_a_view_or_has_no_depth_is_not_shown():
     before = wall()
     before[:, :10] = 2.0  # something near stands before it in one view
     shown = _shown(wall(), rig(0.0), [wall(), before], rig(0.0, 0.0))
     assert not bool(shown[:, :10].any())
     assert bool(shown[:, 10:].all())
-
-
-def test_a_pixel_without_depth_is_not_shown():
     empty = wall()
-    empty[2] = 0.0
-    shown = _shown(empty, rig(0.0), [wall()] * 2, rig(0.0, 0.0))
-    assert shown.sum() == (HEIGHT - 1) * WIDTH
+    empty[2] = 0.0  # without depth
+    assert _shown(empty, rig(0.0), [wall()] * 2, rig(0.0, 0.0)).sum() == (HEIGHT - 1) * WIDTH
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from factories import random_views
+from tiny_scenes import narrow_lpips
 
 from kgs._support.errors import DataError
 from kgs.datasets.scene import Scene
@@ -19,6 +20,18 @@ from kgs.metrics.evaluate import BEST, clipped_psnr, evaluate, mean_psnr
 from kgs.metrics.lpips import Lpips
 
 KEYS = {"psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled", "views"}
+
+
+@pytest.fixture
+def lpips():
+    """A narrow network of random weights."""
+    with narrow_lpips():
+        return Lpips()
+
+
+def scene_of(views):
+    none = torch.zeros(0, 3)
+    return Scene(views, views, none, none, "none", torch.zeros(3), torch.zeros(3), Path("scene"))
 
 
 def renderer_of(images):
@@ -110,10 +123,8 @@ def test_no_views_give_no_numbers():
     assert evaluate(renderer_of(empty.images), empty) == {**dict.fromkeys(KEYS), "views": []}
 
 
-def test_lpips_is_measured_in_both_scalings():
+def test_lpips_is_measured_in_both_scalings(lpips):
     views = random_views(count=1)
-    torch.manual_seed(0)
-    lpips = Lpips()
     render = distort(views.images).clamp(0, 1)
     result = evaluate(renderer_of(render), views, lpips)
     assert result["lpips_vgg"] == pytest.approx(lpips(render, views.images).item())
@@ -121,33 +132,25 @@ def test_lpips_is_measured_in_both_scalings():
     assert result["lpips_vgg"] != pytest.approx(result["lpips_vgg_unscaled"])
 
 
-def test_lpips_that_is_not_measured_again_is_kept():
+def test_lpips_that_is_not_measured_again_is_kept(lpips):
     views = random_views()
-    none = torch.zeros(0, 3)
-    scene = Scene(views, views, none, none, "none", torch.zeros(3), torch.zeros(3), Path("scene"))
     render = renderer_of(distort(views.images).clamp(0, 1))
-    torch.manual_seed(0)
-    lpips = Lpips()
     measured = [evaluate(render, views, lpips, correct_color=correct_color) for correct_color in (False, True)]
     metrics = {"test": measured[0], "train": measured[0], "color_corrected": measured[1], "steps": 3}
-    assert measure_again(saved(render, scene, metrics), Path("metrics.json")) == metrics
+    assert measure_again(saved(render, scene_of(views), metrics), Path("metrics.json")) == metrics
     wrong = {**metrics, "color_corrected": {"views": []}}
     with pytest.raises(DataError, match="color_corrected"):
-        measure_again(saved(render, scene, wrong), Path("metrics.json"))
+        measure_again(saved(render, scene_of(views), wrong), Path("metrics.json"))
 
 
 def test_masked_views_without_gains_are_recoloured_for_a_render_that_takes_a_camera_only():
     views = random_views()
     masked = replace(views, alphas=torch.full_like(views.images[:, :1], 0.5))
     render = renderer_of(distort(views.images))
-    assert evaluate(render, masked, correct_color=True) == evaluate(render, views, correct_color=True)
-    none = torch.zeros(0, 3)
-    scene = Scene(masked, masked, none, none, "none", torch.zeros(3), torch.zeros(3), Path("scene"))
-    metrics = {
-        part: evaluate(render, masked, correct_color=part == "color_corrected")
-        for part in ("test", "train", "color_corrected")
-    }
-    assert measure_again(saved(render, scene, metrics), Path("metrics.json")) == metrics
+    plain, recolored = (evaluate(render, masked, correct_color=correct_color) for correct_color in (False, True))
+    assert recolored == evaluate(render, views, correct_color=True)
+    metrics = {"test": plain, "train": plain, "color_corrected": recolored}
+    assert measure_again(saved(render, scene_of(masked), metrics), Path("metrics.json")) == metrics
 
 
 def test_float64_renders_are_measured():

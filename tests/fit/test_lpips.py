@@ -1,13 +1,13 @@
 """LPIPS: the authors' figures where the weights are at hand, hand-made networks everywhere else."""
 
 import os
-import shutil
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from tiny_scenes import narrow_lpips, write_lpips
 
 from kgs._support.errors import DataError
 from kgs.metrics.lpips import Lpips
@@ -17,36 +17,27 @@ VGG16 |= {17: (512, 256), 19: (512, 512), 21: (512, 512), 24: (512, 512), 26: (5
 HEADS = (64, 128, 256, 512, 512)
 SHIFT = np.array([-0.030, -0.088, -0.188])
 SCALE = np.array([0.458, 0.448, 0.450])
-
-
-def zero_arrays():
-    """Zeros in the layout of the files: all features are 0, and so is the distance."""
-    features = {}
-    for index, shape in VGG16.items():
-        features[f"features.{index}.weight"] = np.zeros((*shape, 3, 3), np.float16)
-        features[f"features.{index}.bias"] = np.zeros(shape[0], np.float16)
-    heads = {f"lin{i}": np.zeros(width, np.float32) for i, width in enumerate(HEADS)}
-    return features, heads
-
-
-def write(folder, features, heads):
-    np.savez(folder / "vgg16_features.npz", **features)
-    np.savez(folder / "lpips_lin_vgg16.npz", **heads)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def zeros(tmp_path_factory):
-    """A folder with whole files."""
-    return write(tmp_path_factory.mktemp("zeros"), *zero_arrays())
+FEATURES_FILE, HEADS_FILE = "vgg16_features.npz", "lpips_lin_vgg16.npz"
 
 
 @pytest.fixture
-def copied(zeros, tmp_path):
-    """A copy whose heads a test may damage."""
-    shutil.copy(zeros / "lpips_lin_vgg16.npz", tmp_path)
-    (tmp_path / "vgg16_features.npz").symlink_to(zeros / "vgg16_features.npz")
+def narrow():
+    with narrow_lpips():
+        yield
+
+
+@pytest.fixture
+def files(narrow, tmp_path):
+    """A folder with whole files of a narrow network."""
+    write_lpips(tmp_path)
     return tmp_path
+
+
+def change_arrays(path, change):
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    change(arrays)
+    np.savez(path, **arrays)
 
 
 def flat(color, size=64):
@@ -72,14 +63,26 @@ def test_published_figures(weights, image, expected):
     assert distance.item() == pytest.approx(expected, abs=1e-4)
 
 
-def test_first_block_by_hand_averaged_over_the_image(tmp_path):
-    """Its two layers copy red and green."""
-    features, heads = zero_arrays()
-    for layer in (0, 2):
-        features[f"features.{layer}.weight"][0, 0, 1, 1] = 1
-        features[f"features.{layer}.weight"][1, 1, 1, 1] = 1
-    heads["lin0"][:2] = 0.5, 2.0
-    lpips = Lpips.load(write(tmp_path, features, heads))
+def test_the_network_is_vgg16():
+    with torch.device("meta"):
+        found = {name: tuple(value.shape) for name, value in Lpips().state_dict().items()}
+    expected = {f"features.{layer}.weight": (*shape, 3, 3) for layer, shape in VGG16.items()}
+    expected |= {f"features.{layer}.bias": (shape[0],) for layer, shape in VGG16.items()}
+    assert found == expected | {f"lin{i}": (width,) for i, width in enumerate(HEADS)}
+
+
+def test_first_block_by_hand_averaged_over_the_image(files):
+    """Its two layers copy red and green; all other features are 0."""
+
+    def copy(arrays):
+        for array in arrays.values():
+            array[...] = 0
+        for layer in (0, 2):
+            arrays[f"features.{layer}.weight"][[0, 1], [0, 1], 1, 1] = 1
+
+    change_arrays(files / FEATURES_FILE, copy)
+    change_arrays(files / HEADS_FILE, lambda heads: heads.update(lin0=np.array([0.5, 2.0, 0.0, 0.0])))
+    lpips = Lpips.load(files)
     x, y = (0.9, 0.6, 0.1), (0.7, 0.95, 0.4)
 
     def direction(color, rescale):
@@ -95,31 +98,26 @@ def test_first_block_by_hand_averaged_over_the_image(tmp_path):
         assert lpips(flat(x), half, rescale=rescale).item() == pytest.approx(expected / 4, rel=1e-5)
 
 
-def test_a_random_network_gives_a_distance():
-    torch.manual_seed(0)
+@pytest.mark.usefixtures("narrow")
+def test_a_random_network_gives_a_distance_whose_gradient_reaches_the_image_alone():
     lpips = Lpips()
     x, y = torch.rand(2, 2, 3, 16, 19)
     assert torch.equal(lpips(x, x), torch.zeros(2))
     assert (lpips(x, y) > 0).all()
     torch.testing.assert_close(lpips(x, y), lpips(y, x))
     torch.testing.assert_close(lpips(x, y)[1:], lpips(x[1:], y[1:]))
-
-
-def test_gradient_reaches_the_image_and_not_the_weights():
-    torch.manual_seed(0)
-    lpips = Lpips()
-    image = torch.rand(1, 3, 16, 16, requires_grad=True)
-    lpips(image, torch.rand(1, 3, 16, 16)).backward()
-    assert image.grad.abs().max() > 0
+    lpips(x.requires_grad_(), y).sum().backward()
+    assert x.grad.abs().max() > 0
     assert not any(parameter.requires_grad for parameter in lpips.parameters())
 
 
-def test_loading_draws_no_random_numbers(zeros):
+def test_loading_draws_no_random_numbers(files):
     state = torch.get_rng_state()
-    Lpips.load(zeros)
+    Lpips.load(files)
     assert torch.equal(torch.get_rng_state(), state)
 
 
+@pytest.mark.usefixtures("narrow")
 @pytest.mark.parametrize(
     ("argument", "image", "target"),
     [("image", (1, 3, 15, 40), (1, 3, 15, 40)), ("target", (1, 3, 40, 40), (2, 3, 40, 40))],
@@ -129,33 +127,35 @@ def test_wrong_shapes_are_named(argument, image, target):
         Lpips()(torch.rand(image), torch.rand(target))
 
 
-def test_missing_files_are_data_errors(tmp_path, copied):
+def test_missing_files_are_data_errors(files):
     with pytest.raises(DataError, match="nowhere: expected a folder"):
-        Lpips.load(tmp_path / "nowhere")
-    for name in ("lpips_lin_vgg16.npz", "vgg16_features.npz"):
-        (copied / name).unlink()
+        Lpips.load(files / "nowhere")
+    for name in (HEADS_FILE, FEATURES_FILE):
+        (files / name).unlink()
         with pytest.raises(DataError) as error:
-            Lpips.load(copied)
-        assert error.value.path == copied / name
+            Lpips.load(files)
+        assert error.value.path == files / name
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("value", "said"),
     [
-        (lambda heads: heads.pop("lin2"), "lin2: expected an array"),
-        (lambda heads: heads.update(lin2=np.zeros(255, np.float32)), "lin2: expected floats of shape"),
-        (lambda heads: heads.update(lin2=np.zeros((1, 256, 1, 1), np.float32)), "lin2: expected floats of shape"),
-        (lambda heads: heads.update(lin2=np.zeros(256, np.int64)), "lin2: expected floats"),
-        (lambda heads: heads.update(lin2=np.full(256, np.nan)), "lin2: expected finite"),
-        (lambda heads: heads.update(lin2=np.full(256, 1e300)), "lin2: expected finite"),
-        (lambda heads: heads.update(lin2=np.array([object()] * 256)), "lin2: expected floats"),
+        (None, "an array"),
+        (np.zeros(7, np.float32), "floats of shape"),
+        (np.zeros((1, 8, 1, 1), np.float32), "floats of shape"),
+        (np.zeros(8, np.int64), "floats"),
+        (np.full(8, np.nan), "finite"),
+        (np.full(8, 1e300), "finite"),
+        (np.array([object()] * 8), "floats"),
     ],
 )
-def test_broken_arrays_are_data_errors(copied, change, message):
-    _, heads = zero_arrays()
-    change(heads)
-    path = copied / "lpips_lin_vgg16.npz"
-    np.savez(path, **heads)
-    with pytest.raises(DataError, match=message) as caught:
-        Lpips.load(copied)
-    assert caught.value.path == path
+def test_broken_arrays_are_data_errors(files, value, said):
+    def damage(heads):
+        del heads["lin2"]
+        if value is not None:
+            heads["lin2"] = value
+
+    change_arrays(files / HEADS_FILE, damage)
+    with pytest.raises(DataError, match=f"expected {said}") as error:
+        Lpips.load(files)
+    assert (error.value.path, error.value.field) == (files / HEADS_FILE, "lin2")

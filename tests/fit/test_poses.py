@@ -133,27 +133,6 @@ def test_a_fit_turns_wrong_cameras_back():
     assert fixed.scene is wrong
 
 
-def test_a_resumed_fit_has_the_same_cameras(room, tmp_path):
-    points = choose_points(room, CONFIG)
-    path = tmp_path / CHECKPOINT
-    plan = make_plan(room, CONFIG)
-    whole = Trainer(room, plan, points)
-    half = Trainer(room, plan, points)
-    whole.fit()
-    half.fit(lambda trainer, _: trainer.step == 3)
-    half.save(path)
-    resumed = Trainer.resume(room, CONFIG, path)
-    assert torch.equal(resumed.scene.train.cameras.extrinsics, half.scene.train.cameras.extrinsics)
-    resumed.fit()
-    assert torch.equal(resumed.state.poses.extrinsics, whole.state.poses.extrinsics)
-    assert torch.equal(resumed.model.means, whole.model.means)
-    assert not torch.equal(whole.state.poses.extrinsics, room.train.cameras.extrinsics.double())
-    state = whole.state_dict()
-    state["poses"]["extrinsics"] = state["poses"]["extrinsics"][:2]
-    with pytest.raises(ValueError, match=r"^poses: expected extrinsics \(3, 4, 4\), got \(2, 4, 4\)"):
-        whole.load_state_dict(state)
-
-
 @pytest.fixture(scope="module")
 def refined(tmp_path_factory):
     """A scene of three photos, and the folder of a fit that moved its cameras."""

@@ -5,23 +5,80 @@ from dataclasses import replace
 import pytest
 import torch
 from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+from trainers import assert_same_bits, begun, fitted, stop_at
 
 from kgs import DataError
 from kgs.fit import FitConfig, InitialPoints, Trainer
 from kgs.fit.checkpoint import load_checkpoint, save_checkpoint
 from kgs.fit.config import Recipe
+from kgs.fit.decisions import DegreeDecision, ExposureDecision, OverlapDecision
 from kgs.fit.plan import make_plan
 
-pytestmark = pytest.mark.usefixtures("each_backend")
-
 CONFIG = FitConfig(steps=6, drop=0.3, seed=5, evaluations=1, sh_degree=2, recipe=Recipe(grad_threshold=1e-5))
+LONG = replace(CONFIG, steps=24, evaluations=3)  # densified after 10 and 20 steps
+RESETS = replace(CONFIG.recipe, prune_opacity=0.005, reset_interval=3000, reset_recovery=5)
+GAINS = ExposureDecision([[0.8, 0.8, 0.8], [1.0, 1.1, 1.0], [1.25, 1.0, 1.2]], 0.1, 500)
+OPEN = {"steps": None, "drop": None, "sh_degree": None}
+CHOSEN = {"steps": 24, "drop": 0.0, "sh_degree": 1}
+WHY = {"overlap": OverlapDecision(8.0, 8.0, 500, steps=24, drop=0.0), "sh_degree": DegreeDecision(1, "rule")}
+
+# what is in the state: after how many steps the fit stops, its settings, and what is decided about them and why
+STATES = {
+    "before most": (1, {}, {}, {}),
+    "densified": (10, {}, {}, {}),
+    "in a round of the views": (16, {}, {}, {}),
+    "before the last step": (23, {}, {}, {}),
+    "no dropping": (16, {"drop": 0.0}, {}, {}),
+    "harmonics": (6, {"sh_degree": 3}, {}, {}),
+    "one background": (16, {"training_background": "scene"}, {}, {}),
+    "half the pixels": (7, {"coarse": 0.5}, {}, {}),
+    "resets": (8, {"recipe": RESETS}, {}, {}),
+    "poses": (16, {"refine_poses": True}, {}, {}),
+    "haze": (51, {"steps": 56, "evaluations": 1}, {}, {}),
+    "exposure": (16, {}, {}, {"exposure": GAINS}),
+    "what was open": (16, OPEN, CHOSEN, WHY),
+}
+
+
+def assert_same_state(one, other, name="state"):
+    """To the bit, but for times."""
+    if isinstance(one, dict):
+        assert one.keys() == other.keys()
+        for key in one.keys() - {"seconds"}:
+            assert_same_state(one[key], other[key], f"{name}/{key}")
+    elif isinstance(one, Tensor):
+        assert torch.equal(one, other), name
+    elif isinstance(one, list):
+        for i, (first, second) in enumerate(zip(one, other, strict=True)):
+            assert_same_state(first, second, f"{name}/{i}")
+    else:
+        assert one == other, name
+
+
+@pytest.mark.usefixtures("each_backend")
+@pytest.mark.parametrize(("step", "settings", "entries", "decisions"), STATES.values(), ids=STATES)
+def test_a_stopped_and_resumed_fit_has_the_bits_of_one_that_was_not_stopped(
+    scene, points, tmp_path, step, settings, entries, decisions
+):
+    config = replace(LONG, **settings)
+    plan = make_plan(scene, config).decided(entries, **decisions)
+    whole, stopped = Trainer(scene, plan, points), Trainer(scene, plan, points)
+    whole.fit()
+    stopped.fit(stop_at(step))
+    stopped.save(tmp_path / "checkpoint.safetensors")
+    resumed = Trainer.resume(scene, config, tmp_path / "checkpoint.safetensors")
+    assert_same_state(resumed.state_dict(), stopped.state_dict())
+    assert torch.equal(resumed.scene.train.cameras.extrinsics, stopped.scene.train.cameras.extrinsics)
+    assert resumed.step == step < resumed.fit().history["steps"]
+    assert_same_state(resumed.state_dict(), whole.state_dict())
 
 
 @pytest.fixture(scope="module")
-def saved(each_backend, scene, points, tmp_path_factory):
+def saved(scene, points, tmp_path_factory):
     path = tmp_path_factory.mktemp("fit") / "checkpoint.safetensors"
-    trainer = Trainer(scene, make_plan(scene, CONFIG), points)
-    trainer.fit(lambda trainer, _: trainer.step == 2)
+    trainer = begun(scene, points, CONFIG)
+    trainer.fit(stop_at(2))
     trainer.save(path)
     return path
 
@@ -29,18 +86,14 @@ def saved(each_backend, scene, points, tmp_path_factory):
 @pytest.fixture(scope="module")
 def done(each_backend, scene, points):
     """A fit that was left alone."""
-    trainer = Trainer(scene, make_plan(scene, CONFIG), points)
-    trainer.fit()
-    return trainer
+    return fitted(scene, points, CONFIG)
 
 
-def assert_same_bits(a, b):
-    for (name, one), (_, other) in zip(a.model.named_parameters(), b.model.named_parameters(), strict=True):
-        assert torch.equal(one, other), name
+# -- what does not belong to the checkpoint ------------------------------------------------------------------------
 
 
 def changed(scene, part, **changes):
-    """The scene with other values in one of its groups of views; "swap" exchanges the first two."""
+    """The scene with other values in one of its groups of views."""
     views = getattr(scene, part)
     cameras = views.cameras
     values = {"images": views.images, "extrinsics": cameras.extrinsics, "intrinsics": cameras.intrinsics}
@@ -50,49 +103,46 @@ def changed(scene, part, **changes):
     return replace(scene, **{part: replace(views, cameras=cameras, images=values["images"])})
 
 
-def swap(tensor):
+def first_two_exchanged(tensor):
     return tensor[[1, 0, *range(2, len(tensor))]]
 
 
-def nudge(tensor):
+def nudged(tensor):
     tensor.view(-1)[7] += 1e-6
     return tensor
 
 
-@pytest.mark.usefixtures("torch_alone")
+CHANGES = [
+    ("images", first_two_exchanged, "photos"),
+    ("images", nudged, "photos"),
+    ("extrinsics", first_two_exchanged, "poses"),
+    ("extrinsics", nudged, "poses"),
+    ("intrinsics", nudged, "intrinsics"),
+]
+
+
 @pytest.mark.parametrize("part", ["train", "test"])
-@pytest.mark.parametrize("change", [swap, nudge])
-@pytest.mark.parametrize(
-    ("name", "said"), [("images", "photos"), ("extrinsics", "poses"), ("intrinsics", "intrinsics")]
-)
-def test_another_photo_pose_or_matrix_is_named(scene, saved, part, change, name, said):
-    if name == "intrinsics" and change is swap:  # they are all the same
-        other = changed(scene, part, intrinsics=lambda k: k * torch.linspace(1, 1.1, len(k))[:, None, None])
-    else:
-        other = changed(scene, part, **{name: change})
-    with pytest.raises(DataError, match=f"{said} of the {part}.*views: expected those that the fit was begun with"):
-        Trainer.resume(other, CONFIG, saved)
+@pytest.mark.parametrize(("name", "change", "said"), CHANGES)
+def test_another_photo_pose_or_matrix_is_named(scene, saved, part, name, change, said):
+    with pytest.raises(DataError, match=f"{said} of the {part}"):
+        Trainer.resume(changed(scene, part, **{name: change}), CONFIG, saved)
 
 
-@pytest.mark.usefixtures("torch_alone")
 def test_other_views_masks_and_background_are_named(scene, saved):
     views = scene.train
+    everywhere = torch.ones(3, 32, 40, dtype=torch.bool)
     for other, said in (
-        (replace(scene, train=views.select([0, 1])), "names of the training views"),
-        (replace(scene, train=replace(views, alphas=torch.ones(3, 1, 32, 40))), "alphas of the training views"),
-        (
-            replace(scene, train=replace(views, valid_mask=torch.ones(3, 32, 40, dtype=torch.bool))),
-            "valid pixels of the training views",
-        ),
-        (replace(scene, background=torch.tensor([1.0, 1.0, 1.0])), "background"),
+        (replace(scene, train=views.select([0, 1])), "names of the training"),
+        (replace(scene, train=replace(views, alphas=torch.ones(3, 1, 32, 40))), "alphas of the training"),
+        (replace(scene, train=replace(views, valid_mask=everywhere)), "valid pixels of the training"),
+        (replace(scene, background=torch.ones(3)), "background"),
     ):
         with pytest.raises(DataError, match=said):
             Trainer.resume(other, CONFIG, saved)
 
 
-@pytest.mark.usefixtures("torch_alone")
 @pytest.mark.parametrize(
-    ("change", "flag"),
+    ("change", "said"),
     [
         ({"seed": 6}, "seed: expected 5, as the fit was begun with, got 6"),
         ({"drop": 0.0}, "drop: expected 0"),
@@ -104,9 +154,33 @@ def test_other_views_masks_and_background_are_named(scene, saved):
         ({"steps": 1}, "steps: expected 6"),
     ],
 )
-def test_another_setting_is_named_by_its_flag(scene, saved, change, flag):
-    with pytest.raises(DataError, match=flag):
+def test_another_setting_is_named(scene, saved, change, said):
+    with pytest.raises(DataError, match=said):
         Trainer.resume(scene, replace(CONFIG, **change), saved)
+
+
+@pytest.mark.parametrize(
+    "name", ["config", "scene", "model", "optimizer", "densifier", "order", "drop", "step", "stack"]
+)
+def test_a_wrong_entry_is_a_data_error(scene, saved, tmp_path, name):
+    path = tmp_path / "checkpoint.safetensors"
+    state = load_checkpoint(saved)
+    others = [None, 7.5, "text", {}]
+    if name != "stack":  # which is empty after each round of the views
+        others.append([])
+    without = {key: value for key, value in state.items() if key != name}
+    for values in (without, *({**state, name: value} for value in others)):
+        save_checkpoint(path, values)
+        with pytest.raises(DataError, match=r"checkpoint\.safetensors"):
+            Trainer.resume(scene, CONFIG, path)
+
+
+def test_poses_of_another_number_of_photos_are_refused(scene, points):
+    trainer = begun(scene, points, CONFIG, refine_poses=True)
+    state = trainer.state_dict()
+    state["poses"]["extrinsics"] = state["poses"]["extrinsics"][:2]
+    with pytest.raises(ValueError, match="^poses: expected"):
+        trainer.load_state_dict(state)
 
 
 def test_a_mistake_in_kgs_or_of_the_caller_is_no_fault_of_the_checkpoint(scene, saved, monkeypatch):
@@ -116,31 +190,31 @@ def test_a_mistake_in_kgs_or_of_the_caller_is_no_fault_of_the_checkpoint(scene, 
     with pytest.raises(ValueError, match="^device: expected"):
         Trainer.resume(scene, replace(CONFIG, device="meta"), saved)
 
-    def broken(*_, **__):
-        raise TypeError("unsupported operand")
+    def failing(error):
+        def fail(*_, **__):
+            raise error
 
-    for function in ("kgs.fit.trainer.make_plan", "kgs.fit.state.TrainState._assemble", "kgs.fit.trainer.targets"):
+        return fail
+
+    for function, error in (
+        ("kgs.fit.trainer.make_plan", TypeError("unsupported operand")),
+        ("kgs.fit.state.TrainState._assemble", TypeError("unsupported operand")),
+        ("kgs.fit.trainer.targets", TypeError("unsupported operand")),
+        ("kgs.fit.state.GaussianModel", torch.OutOfMemoryError("out of memory")),
+    ):
         with monkeypatch.context() as patch:
-            patch.setattr(function, broken)
-            with pytest.raises(TypeError, match="unsupported operand"):
+            patch.setattr(function, failing(error))
+            with pytest.raises(type(error), match=str(error)):
                 Trainer.resume(scene, CONFIG, saved)
 
-    def without_memory(*_, **__):
-        raise torch.OutOfMemoryError("out of memory")
 
-    monkeypatch.setattr("kgs.fit.state.GaussianModel", without_memory)
-    with pytest.raises(torch.OutOfMemoryError):
-        Trainer.resume(scene, CONFIG, saved)
+# -- what may change -----------------------------------------------------------------------------------------------
 
 
 def test_a_fit_may_go_on_on_another_device(scene, saved):
-    resumed = Trainer.resume(scene, replace(CONFIG, device="cpu:0"), saved)
-    assert resumed.step == 2
-    streams = [
-        resumed.state.order.get_state(),
-        resumed.state.drop.get_rng_state(),
-        resumed.state.densifier.generator.get_state(),
-    ]
+    state = Trainer.resume(scene, replace(CONFIG, device="cpu:0"), saved).state
+    assert state.step == 2
+    streams = [state.order.get_state(), state.drop.get_rng_state(), state.densifier.generator.get_state()]
     assert {stream.device.type for stream in streams} == {"cpu"}
 
 
@@ -152,15 +226,14 @@ def test_a_finished_fit_can_be_trained_on_and_says_what_that_means(scene, done, 
         Trainer.resume(scene, replace(CONFIG, steps=5), path)
     trainer = Trainer.resume(scene, longer, path)
     assert [note for note in trainer.state.notes if "from step 6" in note and "fit of 9 steps from the start" in note]
-    trainer.fit(lambda trainer, _: trainer.step == 7)
+    trainer.fit(stop_at(7))
     assert trainer.state.drop.progress == 7 / 9
     assert trainer.model.sh_degree == done.model.sh_degree == 2  # nothing learned is switched off
     trainer.save(path)
     again = Trainer.resume(scene, longer, path)
-    assert again.state.notes == trainer.state.notes
     trainer.fit()
     again.fit()
-    assert_same_bits(trainer, again)
+    assert_same_state(again.state_dict(), trainer.state_dict())
     assert [point["step"] for point in again.state.curve] == [6, 9]
     again.save(path)
     many = Trainer.resume(scene, replace(CONFIG, steps=1001), path)
@@ -168,8 +241,7 @@ def test_a_finished_fit_can_be_trained_on_and_says_what_that_means(scene, done, 
 
 
 def test_a_loop_of_ones_own(scene, points, done):
-    plan = make_plan(scene, CONFIG)
-    by_hand = Trainer(scene, plan, points)
+    by_hand = begun(scene, points, CONFIG)
     losses = []
     kept = None
     while by_hand.step < CONFIG.steps:
@@ -179,7 +251,8 @@ def test_a_loop_of_ones_own(scene, points, done):
     assert_same_bits(by_hand, done)
     with pytest.raises(ValueError, match="steps"):
         by_hand.train_step()
-    other = Trainer(scene, plan, InitialPoints(points.points[:20], points.colors[:20], "random"))
+    other = begun(scene, InitialPoints(points.points[:20], points.colors[:20], "random"), CONFIG)
+    plan = other.plan
     with pytest.raises(ValueError, match="^decisions: "):
         other.load_state_dict(kept | {"decisions": {"exposure": {}}})
     assert (other.step, other.plan) == (0, plan)
@@ -190,23 +263,7 @@ def test_a_loop_of_ones_own(scene, points, done):
         assert_same_bits(trainer, done)
 
 
-@pytest.mark.usefixtures("torch_alone")
-@pytest.mark.parametrize(
-    "name", ["config", "scene", "model", "optimizer", "densifier", "order", "drop", "step", "stack"]
-)
-@pytest.mark.parametrize("value", [None, 7.5, "gone", [], {}])
-def test_a_wrong_entry_is_a_data_error(scene, saved, tmp_path, name, value):
-    state = load_checkpoint(saved)
-    state[name] = value
-    if value == "gone":
-        del state[name]
-    if (name, value) == ("stack", []):
-        pytest.skip("it is empty after each round of the views")
-    save_checkpoint(tmp_path / "checkpoint.safetensors", state)
-    with pytest.raises(DataError, match=r"checkpoint\.safetensors"):
-        Trainer.resume(scene, CONFIG, tmp_path / "checkpoint.safetensors")
-
-
+@pytest.mark.usefixtures("each_backend")
 @pytest.mark.parametrize("photo", [0.0, 1.0])
 def test_photos_of_one_colour_can_be_fitted_and_met_exactly(scene, points, tmp_path, photo):
     """All black over black, or white over white; the test view has nothing of the scene in sight."""
@@ -214,20 +271,8 @@ def test_photos_of_one_colour_can_be_fitted_and_met_exactly(scene, points, tmp_p
     away[:, :3, 3] += torch.tensor([0.0, 0.0, -1e6])
     blank = changed(scene, "test", extrinsics=lambda _: away, images=lambda images: torch.full_like(images, photo))
     blank = changed(blank, "train", images=lambda images: torch.full_like(images, photo))
-    blank = replace(blank, background=torch.full((3,), photo))
-    trainer = Trainer(blank, make_plan(blank, CONFIG), points)
-    trainer.fit()
+    trainer = fitted(replace(blank, background=torch.full((3,), photo)), points, CONFIG)
     assert trainer.step == CONFIG.steps
     assert trainer.state.curve[-1]["test_psnr"] is None
     assert trainer.state.curve[-1]["train_psnr"] > 0
     trainer.save(tmp_path / "checkpoint.safetensors")
-
-
-def test_a_program_in_float64_fits_the_same_bits(scene, points, done):
-    torch.set_default_dtype(torch.float64)
-    try:
-        trainer = Trainer(scene, make_plan(scene, CONFIG), points)
-        trainer.fit()
-    finally:
-        torch.set_default_dtype(torch.float32)
-    assert_same_bits(trainer, done)

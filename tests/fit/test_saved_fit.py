@@ -1,10 +1,7 @@
 """config.json of a fit: what is written is read, and what is wrong is named."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -17,7 +14,7 @@ REQUEST = SceneRequest("/photos", train_views=3, downscale=2.0, roll=-90.0, phot
 VALUES = REQUEST.to_dict()
 
 
-def written(path: Path, request: Any = VALUES, **fit: Any) -> Path:
+def written(path, request=VALUES, **fit):
     path.write_text(json.dumps({"request": request, "fit": FitConfig().to_dict() | fit, "extent": 1.0}))
     return path
 
@@ -26,12 +23,12 @@ def written(path: Path, request: Any = VALUES, **fit: Any) -> Path:
     "config",
     [FitConfig(), FitConfig(**DETAILS["high"].entries), FitConfig(init="file", init_file=Path("/a.ply"))],
 )
-def test_what_was_written_comes_back(tmp_path: Path, config: FitConfig) -> None:
+def test_what_was_written_comes_back(tmp_path, config):
     path = written(tmp_path / "config.json", **config.to_dict())
     assert read_settings(path) == (REQUEST, config)
 
 
-def test_entries_that_older_files_lack_have_their_defaults(tmp_path: Path) -> None:
+def test_entries_that_older_files_lack_have_their_defaults(tmp_path):
     path = written(tmp_path / "config.json", {"scene": "/photos", "train_views": None, "unknown": 1})
     assert read_settings(path)[0] == SceneRequest("/photos")
 
@@ -45,7 +42,7 @@ WRONG |= {"background": ("red",), "points": (["none"],), "photos": (1,), "roll":
     [(None, "request"), ({}, "request.scene")]
     + [(VALUES | {name: value}, f"request.{name}") for name, values in WRONG.items() for value in values],
 )
-def test_wrong_requests_are_named(tmp_path: Path, request_: Any, field: str) -> None:
+def test_wrong_requests_are_named(tmp_path, request_, field):
     path = written(tmp_path / "config.json", request_)
     with pytest.raises(DataError, match="expected") as error:
         read_settings(path)
@@ -55,6 +52,6 @@ def test_wrong_requests_are_named(tmp_path: Path, request_: Any, field: str) -> 
 @pytest.mark.parametrize(
     "fit", [{"steps": "2000"}, {"init_file": 3}, {"recipe": []}, {"recipe": {"speed": 1.0}}, {"stepz": 1}]
 )
-def test_wrong_numbers_of_the_fit_are_named(tmp_path: Path, fit: dict[str, Any]) -> None:
+def test_wrong_numbers_of_the_fit_are_named(tmp_path, fit):
     with pytest.raises(DataError, match=r"config\.json.*fit"):
         read_settings(written(tmp_path / "config.json", **fit))

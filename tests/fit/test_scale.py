@@ -1,9 +1,5 @@
 """A fit in another unit: the same pictures from scaled cameras, and depths that are multiplied."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import pytest
 import torch
 from factories import as_model, random_gaussians, random_views
@@ -18,7 +14,7 @@ FACTORS = (0.01, 3.7, 1000.0)
 
 
 @pytest.fixture
-def fit(tmp_path: Any) -> Fit:
+def fit(tmp_path):
     """Gaussians with harmonics before cameras of a scene whose origin is far away, some before the near plane."""
     gaussians = random_gaussians(300, 0, torch.float32, sh_degree=2)
     model = as_model(gaussians)
@@ -32,7 +28,7 @@ def fit(tmp_path: Any) -> Fit:
 
 
 @pytest.mark.parametrize("factor", FACTORS)
-def test_scaled_cameras_see_the_same_of_a_scaled_splat(fit: Fit, factor: float) -> None:
+def test_scaled_cameras_see_the_same_of_a_scaled_splat(fit, factor):
     large = scaled(fit, factor)
     for part in ("train", "test"):
         views = getattr(fit.scene, part)
@@ -47,7 +43,7 @@ def test_scaled_cameras_see_the_same_of_a_scaled_splat(fit: Fit, factor: float) 
             assert (depth > 0).float().mean() > 0.1
 
 
-def test_points_of_the_files_are_multiplied_with_the_splat(fit: Fit) -> None:
+def test_points_of_the_files_are_multiplied_with_the_splat(fit):
     """Centres, Gaussians and initial points, in the coordinates that files have."""
     large = scaled(fit, 3.0)
     for before, after in (
@@ -60,7 +56,7 @@ def test_points_of_the_files_are_multiplied_with_the_splat(fit: Fit) -> None:
     assert fit.options.near_plane * 3 == large.options.near_plane
 
 
-def test_a_flat_disc_stays_flat_and_the_rest_as_it_is(fit: Fit) -> None:
+def test_a_flat_disc_stays_flat_and_the_rest_as_it_is(fit):
     model = fit.model
     model.log_scales.data[0, 1] = -torch.inf
     model.antialiased = True
@@ -74,7 +70,7 @@ def test_a_flat_disc_stays_flat_and_the_rest_as_it_is(fit: Fit) -> None:
 
 
 @pytest.mark.parametrize("factor", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_factor_is_a_number_above_0(fit: Fit, factor: float) -> None:
+def test_a_factor_is_a_number_above_0(fit, factor):
     for function, value in ((scaled, fit), (scaled_model, fit.model)):
         with pytest.raises(ValueError, match=r"^factor: "):
             function(value, factor)

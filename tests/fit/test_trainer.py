@@ -1,44 +1,31 @@
-"""Trainer: determinism, resume, and that nothing depends on the test views."""
+"""Trainer: determinism, what it does in which step, where it stops, and that nothing depends on the test views."""
 
 import contextlib
 import math
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise, product
 
 import pytest
 import torch
+import trainers
 from kornia.geometry.camera import PinholeCamera
+from trainers import assert_same_bits, stop_at
 
 from kgs import TrainingDiverged
 from kgs.datasets.scene import Views
 from kgs.densify import Densifier
 from kgs.fit.config import PAPER, FitConfig, Recipe
-from kgs.fit.plan import make_plan
-from kgs.fit.trainer import Trainer
 from kgs.init_points import InitialPoints
 from kgs.renderer import GaussianRenderer
 
 CONFIG = FitConfig(steps=30, drop=0.3, seed=5, evaluations=3, recipe=Recipe(grad_threshold=1e-5))
+begun = partial(trainers.begun, config=CONFIG)
+fitted = partial(trainers.fitted, config=CONFIG)
 
 
 def parameters(trainer):
     return {name: value.detach().clone() for name, value in trainer.model.named_parameters()}
-
-
-def assert_same_bits(a, b):
-    for name, value in parameters(a).items():
-        assert torch.equal(value, parameters(b)[name]), name
-
-
-def begun(scene, points, **changes):
-    """A trainer of CONFIG with these changes."""
-    return Trainer(scene, make_plan(scene, replace(CONFIG, **changes)), points)
-
-
-def fitted(scene, points, **changes):
-    trainer = begun(scene, points, **changes)
-    trainer.fit()
-    return trainer
 
 
 @pytest.fixture(scope="module")
@@ -66,29 +53,24 @@ def test_a_fit_has_the_same_bits_on_any_number_of_threads(set_threads, scene):
     assert_same_bits(*trainers)
 
 
-@pytest.mark.slow
-def test_opacities_decay_or_are_reset_when_the_schedule_says(scene, points, monkeypatch):
+DECAYED = Recipe(opacity_decay=0.9, decay_from=0.5)
+RESETS = Recipe(prune_opacity=0.005, opacity_decay=1.0, reset_interval=3000, reset_recovery=5)
+
+
+@pytest.mark.parametrize(
+    ("recipe", "name", "value", "steps"),
+    [
+        (DECAYED, "decay_opacity", 0.9, range(16, 30)),  # the last step only looks
+        (RESETS, "reset_opacity", RESETS.reset_opacity, (9, 18)),
+    ],
+)
+def test_opacities_decay_or_are_reset_when_the_schedule_says(scene, points, monkeypatch, recipe, name, value, steps):
     done = []
-
-    def note(name):
-        plain = getattr(Densifier, name)
-
-        def noted(self, value):
-            done.append((name, trainer.step, value))
-            return plain(self, value)
-
-        monkeypatch.setattr(Densifier, name, noted)
-
-    for name in ("decay_opacity", "reset_opacity"):
-        note(name)
-    trainer = begun(scene, points, recipe=Recipe(opacity_decay=0.9, decay_from=0.5))
-    trainer.fit()
-    assert done == [("decay_opacity", step, 0.9) for step in range(16, 30)]  # the last step only looks
-    done.clear()
-    recipe = Recipe(prune_opacity=0.005, opacity_decay=1.0, reset_interval=3000, reset_recovery=5)
+    for method in ("decay_opacity", "reset_opacity"):
+        monkeypatch.setattr(Densifier, method, lambda _, given, of=method: done.append((of, trainer.step, given)))
     trainer = begun(scene, points, recipe=recipe)
     trainer.fit()
-    assert done == [("reset_opacity", step, recipe.reset_opacity) for step in (9, 18)]
+    assert done == [(name, step, value) for step in steps]
 
 
 def test_harmonics_come_one_degree_after_the_other(scene, points):
@@ -103,7 +85,7 @@ def test_another_seed_other_bits(each_backend, scene, points):
     means = []
     for seed in (5, 6):
         trainer = begun(scene, points, seed=seed)
-        trainer.fit(lambda trainer, _: trainer.step == 3)
+        trainer.fit(stop_at(3))
         means.append(trainer.model.means)
     assert not torch.equal(*means)
 
@@ -117,48 +99,16 @@ def test_with_and_without_drop_see_the_same_views(scene, points):
     assert orders[0] == orders[1]
 
 
-@pytest.mark.parametrize(
-    "at",
-    [
-        pytest.param(1, marks=pytest.mark.slow, id="first"),
-        pytest.param(10, id="densify"),
-        pytest.param(16, id="mid-epoch"),
-        pytest.param(29, marks=pytest.mark.slow, id="last"),
-    ],
-)
-def test_resumed_is_bit_identical(whole, scene, points, tmp_path, at):
-    if at == 10:
-        assert at in whole.plan.schedule.densify
-    first = begun(scene, points)
-    first.fit(lambda trainer, _: trainer.step == at)
-    assert first.step == at
-    first.save(tmp_path / "checkpoint.safetensors")
-    second = Trainer.resume(scene, CONFIG, tmp_path / "checkpoint.safetensors")
-    second.fit()
-    assert_same_bits(whole, second)
-    assert [point["test_psnr"] for point in second.state.curve] == [point["test_psnr"] for point in whole.state.curve]
-
-
 def test_test_views_never_matter(whole, scene, points):
     cameras = scene.test.cameras
     extrinsics = cameras.extrinsics.clone()
     extrinsics[:, :3, 3] += 0.5
-    noise = torch.rand(scene.test.images.shape, generator=torch.Generator().manual_seed(9))
     moved = PinholeCamera(cameras.intrinsics, extrinsics, cameras.height, cameras.width)
-    other = replace(scene, test=Views(moved, noise, scene.test.names))
-    assert_same_bits(whole, fitted(other, points))
-
-
-def test_no_test_views_at_all(whole, scene, points):
-    trainer = fitted(replace(scene, test=scene.test.select([])), points)
-    assert_same_bits(whole, trainer)
-    assert trainer.state.curve[-1]["test_psnr"] is None
-
-
-def test_evaluation_uses_all_gaussians(whole, scene):
-    camera = scene.test.camera(0)
-    assert torch.equal(whole.render(camera), whole.render(camera))
-    assert whole.renderer.training
+    other = Views(moved, torch.rand(scene.test.images.shape), scene.test.names)
+    assert_same_bits(whole, fitted(replace(scene, test=other), points))
+    without = fitted(replace(scene, test=scene.test.select([])), points)
+    assert_same_bits(whole, without)
+    assert without.state.curve[-1]["test_psnr"] is None
 
 
 def test_a_limit_that_leaves_no_room_holds_and_is_said_once(scene, points):
@@ -204,7 +154,7 @@ def test_it_stops_before_a_gradient_that_is_not_finite_is_applied(each_backend, 
 
 def test_it_stops_at_a_parameter_that_is_not_finite(each_backend, scene, points, tmp_path):
     trainer = begun(scene, points)
-    trainer.fit(lambda trainer, _: trainer.step == 2)
+    trainer.fit(stop_at(2))
     trainer.save(tmp_path / "checkpoint.safetensors")
     second = trainer.state_dict()
     said = r"step 3.*{} of Gaussian 7.*checkpoint\.safetensors of step 2"
@@ -229,7 +179,7 @@ def test_it_stops_at_a_gradient_whose_square_overflows(scene, points):
 
 def test_it_stops_where_scales_explode(scene, points):
     trainer = begun(scene, points)
-    trainer.fit(lambda trainer, _: trainer.step == min(trainer.plan.schedule.densify) - 1)
+    trainer.fit(stop_at(min(trainer.plan.schedule.densify) - 1))
     with torch.no_grad():
         trainer.model.log_scales[3, 1] = 40.0
     with pytest.raises(TrainingDiverged, match="scales below 1e[+]06 times the extent.*Gaussian 3"):
@@ -241,7 +191,7 @@ def test_scales_that_grow_without_end_are_bounded(scene, points):
     trainer = begun(scene, points)
     with torch.no_grad():
         trainer.model.log_scales[3, 1] = math.log(5e5 * trainer.state.start.extent)
-    trainer.fit(lambda trainer, _: trainer.step == 20)
+    trainer.fit(stop_at(20))
     assert trainer.model.log_scales.max() <= math.log(1.0001e4 * trainer.state.start.extent)
     trainer.fit()
 
@@ -263,11 +213,18 @@ def test_the_memory_budget_reaches_the_renderer(scene, points):
         small.fit()
 
 
-def test_the_rate_follows_the_papers_schedule(scene, points):
-    trainer = begun(scene, points, steps=12)
-    rates = []
-    trainer.fit(lambda trainer, _: rates.append(trainer.state.drop.rate))
-    assert rates == pytest.approx([0.3 * step / 12 for step in range(1, 13)])
+def test_the_drop_rate_rises_to_the_end_and_renders_and_the_last_tenth_drop_nothing(scene, points):
+    trainer = begun(scene, points, steps=20, evaluations=1)
+    rates, active = [], []
+
+    def note(trainer, _):
+        rates.append(trainer.state.drop.rate)
+        active.append(trainer.state.drop.training)
+        assert torch.equal(*(trainer.render(scene.train.camera(0)) for _ in range(2)))  # of all Gaussians
+
+    trainer.fit(note)
+    assert rates == pytest.approx([0.3 * step / 20 for step in range(1, 21)])
+    assert active[:-1] == [True] * 18 + [False]  # the curve is measured after the last one
 
 
 @pytest.mark.parametrize(
@@ -287,36 +244,12 @@ def test_the_last_steps_skip_no_more_than_all_other_renders(scene, points, recip
     assert trainer.result().options.alpha_threshold == 1 / 255
 
 
-@pytest.mark.slow
-def test_the_first_steps_may_see_half_the_pixels(whole, scene, points, tmp_path):
-    config = replace(CONFIG, coarse=0.5)
-    trainer = Trainer(scene, make_plan(scene, config), points)
+def test_the_first_steps_may_see_half_the_pixels(scene, points):
+    trainer = begun(scene, points, coarse=0.5, steps=6, evaluations=1)
     sizes = []
     trainer.renderer.register_forward_hook(lambda *args: sizes.append(tuple(args[2].image.shape[-2:])))
-    trainer.fit(lambda trainer, _: trainer.step == 15)
-    assert set(sizes[:9]) == {(16, 20)}  # up to the first evaluation, after 10 steps
-    trainer.save(tmp_path / "half.safetensors")
-    resumed = Trainer.resume(scene, config, tmp_path / "half.safetensors")
     trainer.fit()
-    resumed.fit()
-    assert sizes[-1] == (32, 40)
-    assert_same_bits(trainer, resumed)
-    assert not torch.equal(trainer.model.means, whole.model.means[: len(trainer.model)])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("no_drop", "last"), [(0, 30), (1, 29), (3, 27), (50, 27)])  # a tenth of 30 steps is 3
-def test_nothing_is_dropped_in_the_last_steps(scene, points, no_drop, last):
-    trainer = begun(scene, points, no_drop_steps=no_drop, evaluations=1)
-    active = []
-
-    def note(trainer, _):
-        active.append(trainer.state.drop.training)
-        trainer.render(scene.train.camera(0))  # which draws all Gaussians, and may not change this
-        return False
-
-    trainer.fit(note)
-    assert active[:-1] == ([True] * last + [False] * (30 - last))[:-1]  # the curve is measured after the last one
+    assert sizes == [(16, 20)] * 3 + [(32, 40)] * 3
 
 
 # -- backgrounds ------------------------------------------------------------------------------------------------------

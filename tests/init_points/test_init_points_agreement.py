@@ -1,7 +1,5 @@
 """Depth maps of a wall seen by two cameras side by side: which depths are averaged, and which pixels are kept."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -22,16 +20,16 @@ SHARED = (slice(None), slice(5, None))  # of the first view: the second camera s
 SQUARE = 6  # pixels, the side of a small piece of surface
 
 
-def wall(depth: float) -> DepthMap:
+def wall(depth):
     return DepthMap(torch.full((HEIGHT, WIDTH), depth), torch.ones(HEIGHT, WIDTH), EVERYWHERE)
 
 
-def agreed(maps: list[DepthMap], certain: list[torch.Tensor]) -> torch.Tensor:
+def agreed(maps, certain):
     """Which pixels of the first view are kept."""
     return consistent_pixels(GEOMETRY, maps, certain, 0)
 
 
-def test_similar_depths_are_averaged_and_agree_then() -> None:
+def test_similar_depths_are_averaged_and_agree_then():
     maps, certain = [wall(DEPTH), wall(1.025 * DEPTH)], [EVERYWHERE, EVERYWHERE]
     averaged = average_depths(GEOMETRY, maps, certain)
     expected = torch.tensor(2 / (1 / DEPTH + 1 / (1.025 * DEPTH)))
@@ -42,13 +40,13 @@ def test_similar_depths_are_averaged_and_agree_then() -> None:
 
 
 @pytest.mark.parametrize("unlike", ["depth", "own mask", "other mask"])
-def test_other_depths_stay(unlike: str) -> None:
+def test_other_depths_stay(unlike):
     maps = [wall(DEPTH), wall((1.05 if unlike == "depth" else 1.02) * DEPTH)]
     masks = [EVERYWHERE & (unlike != "own mask"), EVERYWHERE & (unlike != "other mask")]
     assert torch.equal(average_depths(GEOMETRY, maps, masks)[0].depths, maps[0].depths)
 
 
-def test_pixels_need_agreeing_neighbours() -> None:
+def test_pixels_need_agreeing_neighbours():
     certain = torch.zeros_like(EVERYWHERE)
     certain[12:14, 14:16] = True  # alone
     certain[:, 20:] = True  # up to a straight edge
@@ -57,16 +55,14 @@ def test_pixels_need_agreeing_neighbours() -> None:
     assert bool(kept[:, 20:].all())
 
 
-def test_depths_that_differ_by_chance_do_not_agree() -> None:
+def test_depths_that_differ_by_chance_do_not_agree():
     generator = torch.Generator().manual_seed(0)
     noisy = [DepthMap(2 + 8 * torch.rand(HEIGHT, WIDTH, generator=generator), torch.ones(HEIGHT, WIDTH), EVERYWHERE)]
     assert not agreed([*noisy, wall(DEPTH)], [EVERYWHERE, EVERYWHERE]).any()
 
 
 @pytest.mark.parametrize("confirming", [1, 2])
-def test_a_small_piece_before_its_surroundings_needs_two_other_views(
-    confirming: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_small_piece_before_its_surroundings_needs_two_other_views(confirming, monkeypatch):
     monkeypatch.setattr(agreement, "MIN_PIECE", 2 * SQUARE**2 / EVERYWHERE.numel())
     monkeypatch.setattr(agreement, "AROUND", 3 * SQUARE / WIDTH)
     beside = cameras(np.array([[0.0, 0.0, 0.0], [0.4, 0.0, 0.0], [-0.4, 0.0, 0.0]]), turn=0.0, size=(WIDTH, HEIGHT))
@@ -80,7 +76,7 @@ def test_a_small_piece_before_its_surroundings_needs_two_other_views(
     assert bool(kept[:8, 8:-8].all())  # the wall
 
 
-def test_small_pieces_at_the_depths_around_them_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_small_pieces_at_the_depths_around_them_stay(monkeypatch):
     monkeypatch.setattr(agreement, "MIN_PIECE", 2 * SQUARE**2 / EVERYWHERE.numel())
     monkeypatch.setattr(agreement, "AROUND", 0.5)
     certain = torch.zeros_like(EVERYWHERE)

@@ -1,11 +1,8 @@
 """Depth maps and dense initial points, against the true depths of the synthetic scene and of a plane."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from kornia.geometry.camera import PinholeCamera
@@ -15,7 +12,7 @@ from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
 from kgs.geometry import ViewGeometry, camera_centers, nearest_pixels, project_points
 from kgs.init_points import dense, initial_points
-from kgs.init_points.dense import PER_SKY, SKY, _first_of_each, _one_per_cell, dense_points, small_enough
+from kgs.init_points.dense import PER_SKY, SKY, _one_per_cell, dense_points, small_enough
 from kgs.init_points.depth_limits import MIN_SIFT, sweep_range
 from kgs.init_points.plane_sweep import FARTHEST, _neighbours, plane_count, planes_wanted, sweep_depths
 from kgs.init_points.sweep_costs import _semi_global
@@ -24,36 +21,36 @@ from kgs.init_points.triangulate import TrackedPoints
 
 
 @pytest.fixture(scope="module")
-def yard() -> tuple[Views, torch.Tensor]:
+def yard():
     return yard_from_above((72, 96))
 
 
 @pytest.fixture(scope="module")
-def views(yard: tuple[Views, torch.Tensor]) -> Views:
+def views(yard):
     return yard[0]
 
 
 @pytest.fixture(scope="module")
-def large() -> tuple[Views, torch.Tensor]:
+def large():
     """The yard in as many pixels as the bounds of depth errors are for."""
     return yard_from_above((96, 128))
 
 
-def span_of(truth: torch.Tensor) -> tuple[float, float]:
+def span_of(truth):
     return 0.8 * float(truth.min()), 1.25 * float(truth.max())
 
 
 @pytest.fixture(scope="module")
-def span(yard: tuple[Views, torch.Tensor]) -> tuple[float, float]:
+def span(yard):
     return span_of(yard[1])
 
 
-def generator(seed: int = 0) -> torch.Generator:
+def generator(seed=0):
     return torch.Generator().manual_seed(seed)
 
 
 @pytest.mark.slow
-def test_depths_of_the_synthetic_scene(large: tuple[Views, torch.Tensor]) -> None:
+def test_depths_of_the_synthetic_scene(large):
     views, truth = large
     for view, depth_map in enumerate(sweep_depths(views, *span_of(truth))):
         accepted = depth_map.is_inner & (depth_map.scores > 0.6)
@@ -64,7 +61,7 @@ def test_depths_of_the_synthetic_scene(large: tuple[Views, torch.Tensor]) -> Non
 
 
 @pytest.mark.slow
-def test_points_lie_on_the_surfaces(large: tuple[Views, torch.Tensor]) -> None:
+def test_points_lie_on_the_surfaces(large):
     views, truth = large
     points, colors, *_ = dense_points(views, *span_of(truth), 10**6, generator())  # all of them, 89 % of which are near
     assert points.shape == colors.shape == (len(points), 3)
@@ -79,7 +76,7 @@ def test_points_lie_on_the_surfaces(large: tuple[Views, torch.Tensor]) -> None:
     assert float((seen - colors).abs().amax(-1).amin(0).median()) == 0.0  # the colour of the pixel it comes from
 
 
-def test_points_lie_where_the_masks_are(views: Views, span: tuple[float, float]) -> None:
+def test_points_lie_where_the_masks_are(views, span):
     masks = torch.zeros(3, 1, 72, 96)
     masks[..., 15:55, 20:80] = 1.0
     points, *_ = dense_points(replace(views, alphas=masks), *span, 2000, generator())
@@ -90,14 +87,14 @@ def test_points_lie_where_the_masks_are(views: Views, span: tuple[float, float])
     assert bool((inside.sum(1) >= 2).all())
 
 
-def test_planes_out_of_range(views: Views) -> None:
+def test_planes_out_of_range(views):
     for near, far in ((0.0, 1.0), (2.0, 1.0), (1.0, math.inf), (math.nan, 1.0)):
         with pytest.raises(ValueError, match="near, far"):
             sweep_depths(views, near, far)
 
 
 @pytest.mark.parametrize("count", [2, pytest.param(10, marks=pytest.mark.slow)])
-def test_two_views_and_many(count: int) -> None:
+def test_two_views_and_many(count):
     scene = synthetic_scene(train_views=count, test_views=1, size=(42, 56), seed=0)
     depths = synthetic_depths(scene.train.cameras, seed=0)
     points, *_ = dense_points(scene.train, 0.8 * float(depths.min()), 1.25 * float(depths.max()), 5000, generator())
@@ -106,7 +103,7 @@ def test_two_views_and_many(count: int) -> None:
 
 
 @pytest.mark.parametrize(("shown", "count"), [("one view", 200), ("grey", 200), ("mirrors", 2000)])
-def test_where_photos_agree_nowhere_random_points_take_over(views: Views, shown: str, count: int) -> None:
+def test_where_photos_agree_nowhere_random_points_take_over(views, shown, count):
     given = {
         "one view": views.select([0]),
         "grey": replace(views, images=torch.full_like(views.images, 0.5)),
@@ -116,7 +113,7 @@ def test_where_photos_agree_nowhere_random_points_take_over(views: Views, shown:
         assert initial_points(given, "dense", count=count).kind == "random"
 
 
-def test_neighbours_stand_neither_too_near_nor_too_far(views: Views) -> None:
+def test_neighbours_stand_neither_too_near_nor_too_far(views):
     """Cameras along a line, at 0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4 and 2 times the depth."""
     centers = torch.tensor([0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 2.0]) * 3.0
     n = len(centers)
@@ -129,12 +126,12 @@ def test_neighbours_stand_neither_too_near_nor_too_far(views: Views) -> None:
     assert _neighbours(line, 7, 3.0)[0] == 6
 
 
-def test_points_that_no_view_has_do_not_stretch_the_planes(views: Views) -> None:
+def test_points_that_no_view_has_do_not_stretch_the_planes(views):
     geometry = ViewGeometry.of(views.cameras)
     near_camera = torch.linalg.inv(geometry.extrinsics[0]) @ torch.tensor([0.5, 0.0, 0.05, 1.0]).double()
     scene = torch.rand(MIN_SIFT, 3, generator=generator(), dtype=torch.float64) + torch.tensor([-0.5, -0.5, 4.0])
 
-    def swept(points: torch.Tensor) -> tuple[float, float]:
+    def swept(points):
         pixels, depths = geometry.project(points)
         everywhere = torch.ones(depths.shape, dtype=torch.bool)
         return sweep_range(TrackedPoints(points, pixels, depths, Tracks(pixels, everywhere)), geometry)
@@ -142,14 +139,14 @@ def test_points_that_no_view_has_do_not_stretch_the_planes(views: Views) -> None
     assert swept(torch.cat([scene, near_camera[None, :3]])) == swept(scene)
 
 
-def test_views_from_one_place_have_no_depth(views: Views) -> None:
+def test_views_from_one_place_have_no_depth(views):
     camera = views.camera(0)
     both = [torch.cat([x, x]) for x in (camera.intrinsics, camera.extrinsics, camera.height, camera.width)]
     twice = Views(PinholeCamera(*both), views.images[[0, 0]], ("a.png", "b.png"))
     assert all(not depth_map.is_inner.any() for depth_map in sweep_depths(twice, 1.0, 10.0))
 
 
-def test_smoothing_keeps_edges_and_repairs_holes() -> None:
+def test_smoothing_keeps_edges_and_repairs_holes():
     """Two flat halves with an edge in the image between them; a third of the pixels say nothing."""
     planes, height, width = 32, 24, 40
     truth = torch.full((height, width), 8)
@@ -164,7 +161,7 @@ def test_smoothing_keeps_edges_and_repairs_holes() -> None:
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.1])
-def test_smoothing_is_the_same_in_all_directions(tilt: float) -> None:
+def test_smoothing_is_the_same_in_all_directions(tilt):
     """Turned and mirrored input, turned and mirrored output."""
     cost = torch.rand(9, 12, 12, generator=generator(3)) + tilt * torch.arange(12)
     grey = torch.rand(12, 12, generator=generator(4))
@@ -173,7 +170,7 @@ def test_smoothing_is_the_same_in_all_directions(tilt: float) -> None:
         assert torch.allclose(move(_semi_global(move(cost), move(grey))), plain, rtol=1e-5)
 
 
-def test_depths_do_not_depend_on_the_unit(views: Views, span: tuple[float, float]) -> None:
+def test_depths_do_not_depend_on_the_unit(views, span):
     views = views.downsample(2)
     small = views.cameras.extrinsics.clone()
     small[:, :3, 3] *= 1e-3
@@ -190,7 +187,7 @@ def test_depths_do_not_depend_on_the_unit(views: Views, span: tuple[float, float
 # -- how many planes, and which points ------------------------------------------------------------------------------
 
 
-def test_as_many_planes_are_wanted_as_a_picture_moves_by_pixels() -> None:
+def test_as_many_planes_are_wanted_as_a_picture_moves_by_pixels():
     """Side by side, a point of depth z is f b / z pixels apart."""
     intrinsics, extrinsics = torch.eye(4).repeat(2, 1, 1), torch.eye(4).repeat(2, 1, 1)
     intrinsics[:, 0, 0] = intrinsics[:, 1, 1] = 500.0
@@ -202,27 +199,29 @@ def test_as_many_planes_are_wanted_as_a_picture_moves_by_pixels() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("draw", [pytest.param("uniform", marks=pytest.mark.slow), "spread"])
-def test_few_points_are_enough_where_many_agree(draw: str) -> None:
+@pytest.mark.parametrize("draw", ["uniform", "spread"])
+def test_few_points_are_enough_where_many_agree(draw):
     result = initial_points(synthetic_scene(train_views=3, size=(72, 96)).train, "dense", count=500, draw=draw)
     assert result.kind == "dense"
     assert 450 <= len(result.points) <= 500
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [50, pytest.param(200, marks=pytest.mark.slow)])
-def test_a_spread_draw_has_one_point_in_each_cell(views: Views, span: tuple[float, float], count: int) -> None:
-    views = views.downsample(2)
-    spread, *_ = dense_points(views, *span, count, generator(), draw="spread")
-    uniform, *_ = dense_points(views, *span, count, generator(), draw="uniform")
-    assert 0.9 * count <= len(spread) <= count
-    assert len(uniform) <= count
-    again, other = (dense_points(views, *span, count, generator(seed), draw="spread")[0] for seed in (0, 1))
-    assert torch.equal(spread, again)
-    assert not torch.equal(spread, other)
+def test_a_spread_draw_has_one_point_in_each_cell_and_takes_all_where_there_are_fewer(views, span):
+    def drawn(count, draw, seed=0):
+        return dense_points(views.downsample(2), *span, count, generator(seed), draw=draw)[0]
+
+    for count in (50, 200):
+        spread = drawn(count, "spread")
+        assert 0.9 * count <= len(spread) <= count
+        assert len(drawn(count, "uniform")) <= count
+    assert torch.equal(spread, drawn(200, "spread"))
+    assert not torch.equal(spread, drawn(200, "spread", seed=1))
+    every = [drawn(10**6, draw).sort(0).values for draw in ("spread", "uniform")]
+    assert torch.equal(*every)
 
 
-def test_a_spread_draw_follows_the_area_not_the_density() -> None:
+def test_a_spread_draw_follows_the_area_not_the_density():
     """Nine tenths of the pixels crowd in a tenth of the width."""
     crowd = torch.rand(9000, 2, generator=generator()) * torch.tensor([10, 100])
     others = torch.rand(1000, 2, generator=generator(1)) * torch.tensor([90, 100]) + torch.tensor([10, 0])
@@ -232,28 +231,13 @@ def test_a_spread_draw_follows_the_area_not_the_density() -> None:
     assert float((drawn[:, 1] < 10).double().mean()) < 0.25
 
 
-def test_the_first_of_each_cell_is_that_of_numpy() -> None:
-    numbers = torch.randint(40, (200,), generator=generator()).numpy()
-    assert _first_of_each(numbers, 50).tolist() == np.unique(numbers, return_index=True)[1].tolist()
-    assert len(_first_of_each(numbers[:0], 50)) == 0
-
-
-@pytest.mark.slow
-def test_a_draw_of_more_than_there_is_takes_all(views: Views, span: tuple[float, float]) -> None:
-    every = [
-        dense_points(views.downsample(2), *span, 10**6, generator(), draw=draw)[0] for draw in ("spread", "uniform")
-    ]
-    assert len(every[0]) == len(every[1])
-    assert torch.equal(every[0].sort(0).values, every[1].sort(0).values)
-
-
 @pytest.fixture(scope="module")
-def before_a_sky() -> tuple[Views, tuple[float, float]]:
+def before_a_sky():
     """Views with a sky, and the range of depths of what stands near."""
     return yard_scene(4, 0).train, (1.3, 6.0)
 
 
-def test_points_of_the_sky_are_as_good_as_infinitely_far_away(before_a_sky) -> None:
+def test_points_of_the_sky_are_as_good_as_infinitely_far_away(before_a_sky):
     sky, (near, far) = before_a_sky
     points, *_ = dense_points(sky, near, far, 2000, generator(), draw="spread")
     pixels, depths = project_points(points, sky.cameras)
@@ -274,7 +258,7 @@ def test_points_of_the_sky_are_as_good_as_infinitely_far_away(before_a_sky) -> N
 
 
 @pytest.mark.slow
-def test_where_there_is_no_sky_no_point_is_far_away(views: Views, span) -> None:
+def test_where_there_is_no_sky_no_point_is_far_away(views, span):
     small = views.downsample(2)
     for found in sweep_depths(small, *span):
         assert float(found.depths.max()) <= 1.001 * FARTHEST * span[1]
@@ -283,7 +267,7 @@ def test_where_there_is_no_sky_no_point_is_far_away(views: Views, span) -> None:
     assert float((project_points(points, views.cameras)[1] > 1.5 * span[1]).double().mean()) < 0.005
 
 
-def test_views_are_halved_until_planes_lie_close_together(views: Views, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_views_are_halved_until_planes_lie_close_together(views, monkeypatch):
     width = views.images.shape[-1]
     shift = planes_wanted(views, 2.0, 10.0)
     monkeypatch.setattr(dense, "SMALLEST", 8)

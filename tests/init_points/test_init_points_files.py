@@ -1,10 +1,6 @@
 """Initial points from files: point clouds, meshes and splats; damaged and packed files are refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,13 +13,12 @@ import kgs
 from kgs._support.errors import DataError
 from kgs.app.fit_folder import fit_folder
 from kgs.app.scene_request import SceneRequest
-from kgs.datasets import Scene
 from kgs.fit import FitConfig
 from kgs.fit.run import choose_points
-from kgs.init_points import initial_points
+from kgs.init_points import files, initial_points
 
 
-def test_file_with_colors(tmp_path: Path) -> None:
+def test_file_with_colors(tmp_path):
     rng = np.random.default_rng(0)
     points, colors = rng.normal(size=(30, 3)).astype(np.float32), rng.integers(0, 256, (30, 4), dtype=np.uint8)
     trimesh.PointCloud(points, colors=colors).export(tmp_path / "cloud.ply")
@@ -34,7 +29,7 @@ def test_file_with_colors(tmp_path: Path) -> None:
     np.testing.assert_allclose(result.colors.numpy(), colors[:, :3] / 255, atol=1e-6)
 
 
-def test_file_without_colors_is_grey(tmp_path: Path) -> None:
+def test_file_without_colors_is_grey(tmp_path):
     trimesh.PointCloud(np.eye(3)).export(tmp_path / "cloud.ply")
     (tmp_path / "mesh.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 2 0\nf 1 2 3\n")
     for name in ("cloud.ply", "mesh.obj"):
@@ -43,7 +38,7 @@ def test_file_without_colors_is_grey(tmp_path: Path) -> None:
         assert torch.equal(result.colors, torch.full((3, 3), 0.5))
 
 
-def test_a_splat_gives_its_colours(tmp_path: Path) -> None:
+def test_a_splat_gives_its_colours(tmp_path):
     generator = torch.Generator().manual_seed(0)
     points, colors = torch.randn(40, 3, generator=generator), torch.rand(40, 3, generator=generator)
     kgs.save_ply(tmp_path / "splat.ply", kgs.GaussianModel.from_points(points, colors, sh_degree=2))
@@ -52,7 +47,7 @@ def test_a_splat_gives_its_colours(tmp_path: Path) -> None:
     assert torch.allclose(result.colors, colors, atol=1e-6)
 
 
-def write_cloud(path: Path, shift: tuple[float, float, float]) -> FitConfig:
+def write_cloud(path, shift):
     """A cloud about a point, and the configuration of a fit that starts from it."""
     points = np.random.default_rng(0).normal(size=(40, 3)) + np.array(shift)
     trimesh.PointCloud(points).export(path)
@@ -60,9 +55,7 @@ def write_cloud(path: Path, shift: tuple[float, float, float]) -> FitConfig:
 
 
 @pytest.mark.parametrize(("shift", "in_front"), [((0.0, 0.0, -50.0), 0), ((500.0, 0.0, 5.0), 40)])
-def test_points_in_another_frame_end_a_fit_before_it_begins(
-    scene: Scene, tmp_path: Path, shift: tuple[float, float, float], in_front: int
-) -> None:
+def test_points_in_another_frame_end_a_fit_before_it_begins(scene, tmp_path, shift, in_front):
     config = write_cloud(tmp_path / "cloud.ply", shift)
     out = tmp_path / "out"
     message = f"cloud.ply: initial points: .* got none of 40, of which {in_front} lie before a camera"
@@ -71,7 +64,7 @@ def test_points_in_another_frame_end_a_fit_before_it_begins(
     assert not any(path.suffix for path in out.iterdir())
 
 
-def test_views_that_show_no_initial_point_are_named(scene: Scene, tmp_path: Path, recwarn: Any) -> None:
+def test_views_that_show_no_initial_point_are_named(scene, tmp_path, recwarn):
     config = write_cloud(tmp_path / "cloud.ply", (0.0, 0.0, 5.0))
     choose_points(scene, config)
     assert not recwarn.list
@@ -82,7 +75,7 @@ def test_views_that_show_no_initial_point_are_named(scene: Scene, tmp_path: Path
         choose_points(replace(scene, train=turned, train_full_size=None), config)
 
 
-def test_the_origin_is_subtracted_before_rounding(tmp_path: Path) -> None:
+def test_the_origin_is_subtracted_before_rounding(tmp_path):
     """At UTM coordinates a float32 is a quarter of a metre."""
     local = np.random.default_rng(0).normal(size=(20, 3)).round(3)
     origin = np.array([432_100.25, 5_400_000.5, 120.0])
@@ -92,7 +85,7 @@ def test_the_origin_is_subtracted_before_rounding(tmp_path: Path) -> None:
     np.testing.assert_allclose(result.points.numpy(), local, atol=1e-5)
 
 
-def test_vertices_without_a_finite_position_are_no_points(tmp_path: Path) -> None:
+def test_vertices_without_a_finite_position_are_no_points(tmp_path):
     """Colours of no points are no table, which was an IndexError."""
     trimesh.PointCloud(np.array([[0, 0, 1.0], [np.nan, 0, 0]])).export(tmp_path / "cloud.ply")
     with pytest.raises(DataError, match="finite"):
@@ -103,23 +96,27 @@ def test_vertices_without_a_finite_position_are_no_points(tmp_path: Path) -> Non
         initial_points(flat(), "file", file=tmp_path / "cloud.ply")
 
 
-def test_a_text_is_bounded_before_it_is_read(tmp_path: Path) -> None:
+def test_a_text_is_bounded_before_it_is_read(tmp_path, monkeypatch):
     """What reads text takes some 75 times its size; binary files of the same size are read."""
-    header = (
-        "ply\nformat {} 1.0\nelement vertex {}\n" + "".join(f"property float {x}\n" for x in "xyz") + "end_header\n"
-    )
-    count = 2**26 // 12 + 1
-    starts = {
-        "ascii.ply": header.format("ascii", count),
-        "comment.ply": header.format("ascii", count).replace("element", "comment format binary\nelement"),
-        "cloud.xyz": "0 0 0\n" * 2000,
-        "binary.ply": header.format("binary_little_endian", count),
-    }
-    for name, start in starts.items():
+    properties = "".join(f"property float {x}\n" for x in "xyz")
+    header = f"ply\nformat {{}} 1.0\nelement vertex {{}}\n{properties}end_header\n"
+
+    def write(name, start, count):
         with open(tmp_path / name, "wb") as file:
             file.write(start.encode())
             file.truncate(len(start) + 12 * count)
-    for name in ("ascii.ply", "comment.ply", "cloud.xyz"):
-        with pytest.raises(DataError, match=rf"{name}: is larger than 64 MiB, the most for a text file"):
-            initial_points(flat(), "file", file=tmp_path / name)
-    assert len(initial_points(flat(), "file", file=tmp_path / "binary.ply").points) == count
+        return tmp_path / name
+
+    count = 2**26 // 12 + 1
+    text = header.format("ascii", count)
+    for path in (
+        write("ascii.ply", text, count),
+        write("comment.ply", text.replace("element", "comment format binary\nelement"), count),
+        write("cloud.xyz", "0 0 0\n" * 2000, count),
+    ):
+        with pytest.raises(DataError, match=rf"{path.name}: is larger than 64 MiB, the most for a text file"):
+            initial_points(flat(), "file", file=path)
+    monkeypatch.setattr(files, "_MAX_TEXT_BYTES", 2**16)
+    count = 2**16 // 12 + 1
+    binary = write("binary.ply", header.format("binary_little_endian", count), count)
+    assert len(initial_points(flat(), "file", file=binary).points) == count

@@ -1,13 +1,11 @@
 """Colours of patches of a wall, whose colour rises evenly so that interpolation is exact."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from init_point_scenes import as_views, cameras
 
 from kgs.geometry import ViewGeometry
-from kgs.init_points.patches import MIN_AGREED, PatchColors, patch_colors
+from kgs.init_points.patches import MIN_AGREED, patch_colors
 from kgs.init_points.plane_sweep import DepthMap
 
 WIDTH, HEIGHT, DEPTH = 40, 32, 4.0
@@ -19,7 +17,7 @@ PIXELS = torch.cartesian_prod(torch.arange(WIDTH), torch.arange(HEIGHT))
 TINTS = torch.tensor([0.0, 0.1, 0.2, 0.3])  # each camera sees the wall in another colour
 
 
-def walls() -> tuple[list[DepthMap], torch.Tensor]:
+def walls():
     """The depths of the wall z = DEPTH in each view, and images of it."""
     rays = torch.cat([PIXELS.double(), torch.ones(len(PIXELS), 1)], 1) @ GEOMETRY.inverse_intrinsics.mT
     world = rays @ GEOMETRY.extrinsics[:, :3, :3]
@@ -27,19 +25,19 @@ def walls() -> tuple[list[DepthMap], torch.Tensor]:
     points = GEOMETRY.centers[:, None] + depths * world
     colors = 0.3 + 0.02 * points[..., [0, 1, 0]] + TINTS[:, None, None]
 
-    def as_images(values: torch.Tensor) -> torch.Tensor:
+    def as_images(values):
         return values.mT.reshape(4, -1, WIDTH, HEIGHT).mT.float()
 
     scores = torch.ones(HEIGHT, WIDTH)
     return [DepthMap(depth, scores, EVERYWHERE) for depth in as_images(depths)[:, 0]], as_images(colors)
 
 
-def patches_of(certain: list[torch.Tensor]) -> PatchColors:
+def patches_of(certain):
     maps, images = walls()
     return patch_colors(as_views(POSED, images), GEOMETRY, maps, certain, [mask.nonzero().flip(1) for mask in certain])
 
 
-def test_patches_have_the_colours_and_directions_of_the_wall() -> None:
+def test_patches_have_the_colours_and_directions_of_the_wall():
     patches = patches_of([EVERYWHERE] * 4)
     assert len(patches) > 4 * 10
     plain = torch.where(patches.visible[..., None], patches.colors - TINTS[:, None], 0.0)
@@ -51,7 +49,7 @@ def test_patches_have_the_colours_and_directions_of_the_wall() -> None:
     torch.testing.assert_close(means[:, 0, :2], (0.3 + 0.02 * points[:, 0, :2]).float(), atol=2e-4, rtol=0)
 
 
-def test_only_views_that_agree_show_a_patch() -> None:
+def test_only_views_that_agree_show_a_patch():
     nowhere = torch.zeros_like(EVERYWHERE)
     assert len(patches_of([EVERYWHERE, EVERYWHERE, nowhere, nowhere])) == 0
     three = patches_of([EVERYWHERE, EVERYWHERE, EVERYWHERE, nowhere])

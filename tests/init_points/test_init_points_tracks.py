@@ -1,7 +1,5 @@
 """Tracks and points from them: blobs at known pixels, closed forms, OpenCV."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
@@ -9,13 +7,12 @@ import torch
 from init_point_scenes import HEIGHT, WIDTH, as_views, cameras, exact_tracks, focal_length, texture
 from kornia.geometry.camera import PinholeCamera
 
-from kgs.datasets.scene import Views
 from kgs.geometry import ViewGeometry
 from kgs.init_points.tracks import Tracks, find_tracks
 from kgs.init_points.triangulate import triangulate, triangulate_certain
 
 
-def test_masks_leave_out_keypoints(planes: Views) -> None:
+def test_masks_leave_out_keypoints(planes):
     masks = torch.ones(3, 1, HEIGHT, WIDTH)
     masks[..., : WIDTH // 2] = 0
     tracks = find_tracks(as_views(planes.cameras, planes.images, masks))
@@ -23,7 +20,7 @@ def test_masks_leave_out_keypoints(planes: Views) -> None:
     assert float(tracks.pixels[tracks.visible][:, 0].min()) > WIDTH // 2 - 1
 
 
-def blobs(pixels: np.ndarray, scales: np.ndarray, size: tuple[int, int]) -> Views:
+def blobs(pixels, scales, size):
     """Gaussian blobs at known pixels as two cameras see them, the second moved along x by 8 pixels of disparity."""
     width, height = size
     ys, xs = np.mgrid[:height, :width]
@@ -36,7 +33,7 @@ def blobs(pixels: np.ndarray, scales: np.ndarray, size: tuple[int, int]) -> View
 
 
 @pytest.mark.parametrize("size", [(320, 240), (520, 400)], ids=["doubled", "as it is"])
-def test_keypoints_have_integer_pixel_centres(size: tuple[int, int]) -> None:
+def test_keypoints_have_integer_pixel_centres(size):
     pixels = np.array([[70.0, 60.0], [131.25, 77.5], [200.0, 101.0], [90.6, 150.3], [180.0, 170.0]])
     tracks = find_tracks(blobs(pixels, np.array([3.0, 4.0, 5.0, 3.5, 6.0]), size))
     for view, offset in ((0, 0.0), (1, 8.0)):
@@ -44,7 +41,7 @@ def test_keypoints_have_integer_pixel_centres(size: tuple[int, int]) -> None:
         assert float(distances.amin(0).max()) < 0.08
 
 
-def test_a_pattern_repeated_along_the_epipolar_lines_is_not_matched() -> None:
+def test_a_pattern_repeated_along_the_epipolar_lines_is_not_matched():
     pattern = texture(3, (1.0, 1.0, 1.0), size=320)[:240]
     posed = cameras(np.array([[0.0, 0, 0], [8.0 / focal_length(320), 0, 0]]), turn=0.0, size=(320, 240))
     counts = []
@@ -56,7 +53,7 @@ def test_a_pattern_repeated_along_the_epipolar_lines_is_not_matched() -> None:
     assert counts[1] < 0.05 * counts[0]
 
 
-def test_triangulation_agrees_with_opencv_for_two_views() -> None:
+def test_triangulation_agrees_with_opencv_for_two_views():
     posed, rng = cameras(), np.random.default_rng(0)
     pixels = rng.uniform(50, 200, (40, 3, 2))
     pixels[:, 2] = pixels[:, 0] + rng.uniform(-30, -10, (40, 1)) * [1, 0]
@@ -71,7 +68,7 @@ def test_triangulation_agrees_with_opencv_for_two_views() -> None:
     np.testing.assert_allclose(points, expected, rtol=0.02, atol=0.02)
 
 
-def test_exact_tracks_give_exact_points_also_of_a_moved_and_scaled_world() -> None:
+def test_exact_tracks_give_exact_points_also_of_a_moved_and_scaled_world():
     points = torch.rand(50, 3, generator=torch.Generator().manual_seed(1)) * 2 + torch.tensor([-1.0, -1.0, 3.0])
     posed, shift = cameras(), torch.tensor([3.0, -2.0, 5.0])
     extrinsics = posed.extrinsics.double()
@@ -85,7 +82,7 @@ def test_exact_tracks_give_exact_points_also_of_a_moved_and_scaled_world() -> No
     torch.testing.assert_close(certain.points / 100 - shift, expected.points, rtol=1e-9, atol=1e-9)
 
 
-def test_uncertain_points_go() -> None:
+def test_uncertain_points_go():
     # Fine; far away (0.1 degrees); fine but for one observation 3 px off; 40 px off; behind the cameras.
     points = torch.tensor([[0.0, 0, 4], [0.0, 0, 400], [0.2, 0.1, 4], [0.1, 0.2, 4], [0.0, 0.1, -4]])
     tracks = exact_tracks(points)

@@ -51,8 +51,10 @@ def correlations(image, other, homography):
 
 
 @pytest.mark.parametrize("backend", ["numba", "torch"])
-@pytest.mark.parametrize(("height", "width", "planes"), [(7, 9, 3), (33, 20, 16), (16, 67, 21), (41, 140, 40)])
-@pytest.mark.parametrize("count", [1, 2, 4])
+@pytest.mark.parametrize(
+    ("count", "height", "width", "planes"),
+    [(1, 7, 9, 3), (4, 7, 9, 3), (1, 33, 20, 16), (4, 16, 67, 21), (2, 41, 140, 17)],  # up to four tiles of pixels
+)
 def test_scores_are_correlations(count, height, width, planes, backend):
     image, others, turns = pictures(count, height, width, planes)
     scores = torch.stack(
