@@ -51,6 +51,16 @@ def test_value_and_gradient_are_kornias_for_any_shape_and_weight(kernels, shape,
     assert_kornias(kernels, shape, weight)
 
 
+@SELDOM_INTERPRETED
+def test_bits_depend_neither_on_threads_nor_on_repetition(kernels, set_threads):
+    pair = make_pair((1, 3, 20, 24) if kernels.interpreted else (1, 3, 150, 131))
+    found = []
+    for threads in (1, 1, 2, 3, 4):
+        set_threads(threads)
+        found.append(value_and_gradient(kernels, pair))
+    assert all(torch.equal(a, b) for other in found[1:] for a, b in zip(found[0], other, strict=True))
+
+
 def test_a_graph_that_is_kept_and_images_without_a_gradient(kernels):
     pair = make_pair((2, 3, 12, 14))
     image, target = (kernels.move(x) for x in pair)

@@ -1,6 +1,7 @@
 """The projection of kernels against that of torch: the same list, values and gradients within float32."""
 
 import importlib
+import math
 
 import numpy as np
 import pytest
@@ -19,10 +20,10 @@ from factories import (
 )
 from kornia.sensors.camera import CameraModelType
 from projection_checks import DIFFERENTIABLE, assert_alike, list_and_gradients, wide_scene
-from targets import SELDOM_INTERPRETED
+from targets import COMPILED, SELDOM_INTERPRETED, TORCH
 
 import kgs
-from kgs import GaussianRenderer, RasterOptions, composite, project
+from kgs import GaussianRenderer, Gaussians, RasterOptions, composite, project
 from kgs.backends import BACKENDS
 from kgs.harmonics import SH_C0
 
@@ -287,8 +288,35 @@ def test_tensors_with_the_negative_bit(kernels):
     lazy = {name: torch.complex(torch.zeros_like(x), -x).conj().imag for name, x in vars(gaussians).items()}
     assert all(x.is_neg() for x in lazy.values())
     found = []
-    for given in (kgs.Gaussians(**lazy), gaussians):
+    for given in (Gaussians(**lazy), gaussians):
         projected = project(given, cameras, backend=kernels.backend)
         features = composite(projected, projected.colors, backend=kernels.backend).features
         found.append([*(getattr(projected, name) for name in DIFFERENTIABLE), features])
     assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
+
+
+@COMPILED
+@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize("value", [0.0, 1e-45, 1e-30, 1e10, 1.8e19, 1e20, 1e30])
+def test_extreme_values_spoil_no_other_gaussian(kernels, field, value):
+    """Some Gaussians are far, huge or tiny in one field: images and gradients of all others are those of torch."""
+    degree = 3 if field in ("means", "colors") else 0
+    gaussians, cameras = wide_scene(degree, 400, cameras=2)
+    some = getattr(gaussians, field)[5:15]
+    some.copy_(some * value if field in ("means", "scales") else torch.full_like(some, value))
+    image, grads = image_and_gradients(gaussians, cameras, kernels)
+    expected, same = image_and_gradients(gaussians, cameras, TORCH)
+    rounding = 1e-5 + 1e-6 * max(0.0, math.log2(value or 1.0)) * (field == "opacities")  # of the exponent
+    torch.testing.assert_close(image, expected, rtol=1e-4, atol=rounding * float(expected.abs().max()))
+    for name in FIELDS:
+        got, wanted = (torch.cat([x[name][:5], x[name][15:]]) for x in (grads, same))
+        assert got.isfinite().all()
+        torch.testing.assert_close(got, wanted, rtol=1e-3, atol=1e-5 * float(wanted.abs().max()))
+
+
+def image_and_gradients(gaussians, cameras, target):
+    inputs = {name: target.move(getattr(gaussians, name)).clone().requires_grad_() for name in FIELDS}
+    image = GaussianRenderer(backend=target.backend)(Gaussians(**inputs), target.move(cameras)).image
+    weights = torch.randn(image.shape, generator=torch.Generator().manual_seed(0))
+    (image * target.move(weights)).sum().backward()
+    return image.detach().cpu(), {name: value.grad.cpu() for name, value in inputs.items()}

@@ -6,10 +6,9 @@ import math
 import pytest
 import torch
 from factories import leaves, one_gaussian, pinhole, posed, random_camera, random_gaussians, random_scene, replace
-from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from kornia.sensors.camera import CameraModelType
 
-import kgs.reference
+import kgs
 from kgs import GaussianRenderer
 from kgs.renderer import blend
 
@@ -17,28 +16,6 @@ pytestmark = pytest.mark.usefixtures("each_backend")
 
 EXACT = {"alpha_threshold": 0.0, "transmittance_stop": 0.0}
 SIZE = (24, 32)
-
-
-def shortest_axes(gaussians, centre):
-    """Towards `centre`, one by one."""
-    found = []
-    for mean, quat, scales in zip(gaussians.means, gaussians.quats, gaussians.scales, strict=True):
-        axis = quaternion_to_rotation_matrix((quat / quat.norm())[None])[0][:, int(scales.argmin())]
-        found.append(axis if axis @ (centre - mean) > 0 else -axis)
-    return torch.stack(found)
-
-
-@pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 2e-5), (torch.float64, 1e-11)])
-def test_normals_are_what_the_weights_of_the_reference_say(dtype, bound):
-    gaussians, camera = random_scene(0, dtype, 60, SIZE)
-    drawn = kgs.reference.layers(gaussians, camera, **EXACT)
-    exact, pose = gaussians.to(torch.float64), camera.extrinsics[0].double()
-    axes = shortest_axes(exact, -pose[:3, :3].T @ pose[:3, 3])
-    expected = torch.einsum("lhw,lc->chw", drawn.weights, axes[drawn.order])
-    out = GaussianRenderer(**EXACT)(gaussians, camera, outputs=("normal",))
-    assert out.image is None
-    assert out.normal.dtype == dtype
-    assert (out.normal[0] - expected).abs().max() <= bound
 
 
 def test_a_disk_shows_its_face_whatever_side_the_camera_is_on():
