@@ -106,7 +106,7 @@ def test_lanes_are_chosen_by_a_limit():
     np.testing.assert_array_equal(out, np.concatenate([np.where(x > LIMIT, y, 7), np.where(x >= LIMIT, y, 7)]))
 
 
-@pytest.mark.parametrize("count", [1, 2, 6, 11, 16])
+@pytest.mark.parametrize("count", [1, 11, 16])
 def test_totals_add_up_each_of_several_lanes(count):
     text = ", ".join(f"load(x, {i * WIDTH})" for i in range(count))
     space = {"__name__": __name__, "load": load, "store": store, "totals": lanes.totals, "total": lanes.total}
