@@ -112,14 +112,13 @@ def test_neither_colors_nor_the_image_are_clamped():
 # -- modes and options --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
-def test_inference_keeps_no_graph(mode, threads, set_threads):
+def test_inference_keeps_no_graph(mode, set_threads):
     # enough tiles for several pieces of work, so that a second thread has some
-    camera = random_camera(200, 400, 0, torch.float32)
+    camera = random_camera(80, 112, 0, torch.float32)
     gaussians, _ = leaves(random_gaussians(400, 0, torch.float32, 1, image_size=100))
     expected = GaussianRenderer()(gaussians, camera, outputs=OUTPUTS)
-    set_threads(threads)
+    set_threads(2)
     with mode():
         out = GaussianRenderer()(gaussians, camera, outputs=OUTPUTS)
     for name in OUTPUTS:

@@ -99,9 +99,3 @@ def assert_close(got, expected, certain=None, bound=1e-5, image_bound=2e-6):
     assert equal.float().mean() >= 1 - 1e-3  # T may be near one half
     for a, b in zip(got[1], expected[1], strict=True):
         assert (a - b).abs().max() <= bound * b.abs().max() if a.numel() else True
-
-
-def assert_equal(got, expected):
-    """To the bit."""
-    for a, b in zip((*got[0], *got[1]), (*expected[0], *expected[1]), strict=True):
-        assert torch.equal(a, b)
