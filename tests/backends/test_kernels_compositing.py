@@ -35,7 +35,7 @@ def test_an_ordinary_scene_is_torch_in_float64(kernels, thresholds):
     options = dict(zip(("alpha_threshold", "transmittance_stop"), thresholds, strict=True))
     size = (12, 13) if kernels.interpreted else (40, 56)
     projected, certain = sample(kernels.few(300, 20), size, thresholds)
-    features = random(len(projected), 3)
+    features = random(len(projected), 5)
     got = outcome(projected, features, certain, kernels, **options)
     assert_close(got, exact(projected, features, certain, **options), certain)
 

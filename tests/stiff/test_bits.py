@@ -12,15 +12,16 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 from factories import FIELDS, OUTPUTS, random_camera, random_gaussians
-from targets import move
+from targets import CPU, move
 from torch import Tensor
 
 from kgs import GaussianRenderer, Gaussians, pinhole_cameras
-from kgs.bench.extremes import gaussians, ordinary, render
+from kgs.bench.extremes import gaussians, ordinary
 from kgs.bench.scenes import PARAMETERS, Scene
 
 Result = tuple[Tensor, dict[str, Tensor]]  # images and the gradients of all parameters
 DTYPES = [torch.float32, torch.float64]
+MATRICES = ("extrinsics", "intrinsics")
 
 
 def largest_difference(results: list[Result]) -> float:
@@ -40,29 +41,26 @@ def largest_difference(results: list[Result]) -> float:
     return largest
 
 
-def drawn(scene: Scene, device: torch.device, dtype: torch.dtype, **options: float) -> Result:
-    """Image and gradients on the device."""
-    cloud, view = scene
-    return render((move(cloud, device), move(view, device)), dtype, **options)
-
-
 def ordinary_views(n: int = 2500, size: tuple[int, int] = (80, 112)) -> Scene:
     """By default enough for several pieces of work."""
     return random_gaussians(n, 0, sh_degree=1, image_size=120), random_camera(*size, 0)
 
 
-def everything(scene: Scene, device: torch.device, dtype: torch.dtype, **options: int) -> Result:
-    """All outputs of a render, and the gradients of Gaussians and camera."""
+def everything(
+    scene: Scene, device: torch.device, dtype: torch.dtype, wanted: tuple[str, ...] = FIELDS, **options: float
+) -> Result:
+    """All outputs of a render, and the gradients of Gaussians, or of these and the camera."""
     made, camera = scene
-    inputs = {name: move(getattr(made, name), device, dtype).clone() for name in FIELDS}
-    inputs |= {name: move(getattr(camera, name), device, dtype).clone() for name in ("extrinsics", "intrinsics")}
-    for value in inputs.values():
-        value.requires_grad_()
+    inputs = {name: move(x, device, dtype).clone() for name, x in vars(made).items()}
+    inputs |= {name: move(getattr(camera, name), device, dtype).clone() for name in MATRICES}
+    for name in wanted:
+        inputs[name].requires_grad_()
     posed = pinhole_cameras(inputs["extrinsics"], inputs["intrinsics"], int(camera.width), int(camera.height))
     out = GaussianRenderer(**options)(Gaussians(*(inputs[name] for name in FIELDS)), posed, outputs=OUTPUTS)
-    slopes = torch.autograd.grad(out.image.square().sum() + out.depth.mean(), list(inputs.values()))
+    loss = out.image.square().sum() + out.depth.mean()
+    slopes = torch.autograd.grad(loss, [inputs[name] for name in wanted])
     images = torch.cat([getattr(out, name).detach() for name in OUTPUTS], 1)
-    return images, dict(zip(inputs, slopes, strict=True))
+    return images, dict(zip(wanted, slopes, strict=True))
 
 
 def with_more(scene: Scene, more: Gaussians, first: bool = False) -> Scene:
@@ -84,23 +82,23 @@ def behind(device: torch.device, dtype: torch.dtype) -> Iterator[Result]:
     """A thousand Gaussians more, at and behind the near plane and the camera."""
     near, means = 2**-7, gaussians(1000, seed=3).means.clone()
     means[:, 2] = torch.tensor([-5.0, -1e-30, 0.0, near]).double().repeat(250)
-    yield drawn(ordinary(100), device, dtype, near_plane=near)
-    yield drawn(with_more(ordinary(100), gaussians(1000, seed=3, means=means)), device, dtype, near_plane=near)
+    yield everything(ordinary(100), device, dtype, near_plane=near)
+    yield everything(with_more(ordinary(100), gaussians(1000, seed=3, means=means)), device, dtype, near_plane=near)
 
 
 def transparent(device: torch.device, dtype: torch.dtype) -> Iterator[Result]:
     """A hundred Gaussians more, at an opacity of 0."""
-    yield drawn(ordinary(100), device, dtype)
-    yield drawn(with_more(ordinary(100), gaussians(100, seed=3, opacities=0.0)), device, dtype)
+    yield everything(ordinary(100), device, dtype)
+    yield everything(with_more(ordinary(100), gaussians(100, seed=3, opacities=0.0)), device, dtype)
 
 
 def under_autocast(device: torch.device, dtype: torch.dtype) -> Iterator[Result]:
-    yield drawn(ordinary(), device, dtype)
+    yield everything(ordinary(), device, dtype)
     before = torch.get_float32_matmul_precision()
     try:
         torch.set_float32_matmul_precision("medium")
         with torch.autocast(device.type, torch.bfloat16):
-            yield drawn(ordinary(), device, dtype)
+            yield everything(ordinary(), device, dtype)
     finally:
         torch.set_float32_matmul_precision(before)
 
@@ -119,14 +117,14 @@ def on_threads(device: torch.device, dtype: torch.dtype) -> Iterator[Result]:
     """Enough pairs for several threads; one to three of them, and one again."""
     for count in (1, 2, 3, 1):
         with threads(count):
-            yield everything(ordinary_views(), device, dtype)
+            yield everything(ordinary_views(), device, dtype, (*FIELDS, *MATRICES))
 
 
 def under_a_budget(device: torch.device, dtype: torch.dtype) -> Iterator[Result]:
     """The image alone: gradients of a Gaussian are then summed in another order."""
     scene = ordinary(300, (64, 64), scales=60.0, opacities=0.02)
     for maximum in (2**30, 2**21):
-        yield drawn(scene, device, dtype, max_bytes=maximum)[0], {}
+        yield everything(scene, device, dtype, max_bytes=maximum)[0], {}
 
 
 CASES: dict[str, tuple[str, str, Callable[[torch.device, torch.dtype], Iterator[Result]]]] = {
@@ -168,7 +166,8 @@ def test_one_and_two_threads_are_equal_in_one_piece_and_in_row_slices(
     found = []
     for count in (1, 2):
         with threads(count):
-            found.append(everything(ordinary_views(n, size), each_device, dtype, max_bytes=max_bytes))
+            scene, wanted = ordinary_views(n, size), (*FIELDS, *MATRICES)
+            found.append(everything(scene, each_device, dtype, wanted, max_bytes=max_bytes))
     assert largest_difference(found) == 0.0
 
 
@@ -178,7 +177,6 @@ def test_what_cannot_be_seen_changes_no_bit_before_or_after_the_others(
 ) -> None:
     scene, more = ordinary(100), gaussians(100, seed=3)
     image, plain = everything(scene, each_device, dtype)
-    plain = {name: plain[name] for name in FIELDS}
     hidden = [
         dataclasses.replace(more, opacities=torch.zeros_like(more.opacities)),
         dataclasses.replace(more, means=-more.means),
@@ -218,13 +216,13 @@ def test_renders_at_the_same_time_are_equal_to_one(each_device: torch.device) ->
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_what_is_not_finite_never_counts_as_equal(value: float) -> None:
-    image, gradients = render(ordinary(5), torch.float64)
+    image, gradients = everything(ordinary(5), CPU, torch.float64)
     wrong = image.clone()
     wrong[0, 0, 0, 0] = value
     assert largest_difference([(wrong, gradients), (wrong, gradients)]) == math.inf
 
 
 def test_a_gradient_of_what_was_added_is_seen() -> None:
-    image, gradients = render(ordinary(5), torch.float64)
+    image, gradients = everything(ordinary(5), CPU, torch.float64)
     more = {name: torch.cat([value, torch.ones_like(value[:1])]) for name, value in gradients.items()}
     assert largest_difference([(image, gradients), (image, more)]) == 1.0

@@ -79,6 +79,12 @@ def test_gradients_are_finite_at_every_size_of_the_footprint(shape, exponent):
         assert all(not x.grad[5].any() for x in inputs[:5])
 
 
+def test_a_gaussian_wider_than_the_world_is_a_veil():
+    for scale in (1e3, 1e6, 1e8):
+        image = GaussianRenderer()(one((scale,) * 3), pinhole(20, 30, (20.0, 20.0), dtype=torch.float32)).image
+        assert (image[0] - 0.8 * torch.tensor([0.3, 0.6, 0.9])[:, None, None]).abs().max() <= 1e-4
+
+
 def test_a_far_gaussian_has_the_colour_of_its_direction():
     """As one on the same ray at a distance of 1e8, whose squares do not overflow."""
     intrinsics = torch.tensor([[30.0, 0, 15.5], [0, 30.0, 11.5], [0, 0, 1]])
