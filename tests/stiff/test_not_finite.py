@@ -7,7 +7,7 @@ import pytest
 import torch
 from factories import FIELDS, join, pinhole, random_camera, random_gaussians, replace
 from kornia.geometry.camera import PinholeCamera
-from projection_checks import wide_scene
+from projection_checks import PACKED, wide_scene
 from stiff_checks import one
 
 from kgs import GaussianModel, GaussianRenderer, Gaussians, composite, pinhole_cameras, project, rasterization
@@ -69,6 +69,7 @@ def test_gradients_are_finite_at_every_size_of_the_footprint(shape, exponent):
     posed = PinholeCamera(inputs[6], inputs[5], camera.height, camera.width)
     out = GaussianRenderer()(Gaussians(*inputs[:5]), posed, outputs=("image", "depth"))
     assert int(out.projected.num_nonfinite) == 0
+    assert all(getattr(out.projected, name).isfinite().all() for name in PACKED)
     assert out.image.isfinite().all()
     (out.image.square().sum() + out.depth.sum()).backward()
     for name, x in zip((*FIELDS, "extrinsics", "intrinsics"), inputs, strict=True):
