@@ -15,6 +15,7 @@ from hypothesis import settings
 from init_point_scenes import painted_planes
 from optional_packages import pytest_pycollect_makemodule  # noqa: F401
 from tables import pytest_addoption, pytest_configure, pytest_terminal_summary  # noqa: F401  # --tables
+from targets import ALL_KERNELS, CARD, CPU, Target, skip_unless_there, speed_up_interpreter
 from yard import on_arc, yard_views
 
 from kgs import backends
@@ -34,10 +35,10 @@ settings.load_profile("kgs")
 # ones, so that no worker ends long before the other.
 _FIRST = [
     "test_resume",
-    *("test_gpu_projection", "test_synthetic", "test_house", "test_synthetic_room", "test_api", "test_wheel"),
-    *("test_gpu_loss", "test_load", "test_transforms", "test_colmap", "test_page_browser", "test_trainer", "test_cli"),
-    *("test_results_folder", "test_init_points_dense", "test_gpu_compositing", "test_overflow", "test_gpu_fit"),
-    *("test_backends_compositing", "test_extreme_cases", "test_cli_process", "test_run", "test_sfm_folders"),
+    *("test_kernels_projection", "test_synthetic", "test_house", "test_synthetic_room", "test_api", "test_wheel"),
+    *("test_kernels_loss", "test_load", "test_transforms", "test_colmap", "test_page_browser", "test_trainer"),
+    *("test_cli", "test_results_folder", "test_init_points_dense", "test_kernels_compositing", "test_not_finite"),
+    *("test_gpu_fit", "test_bits", "test_extreme_cases", "test_cli_process", "test_run", "test_sfm_folders"),
 ]
 
 
@@ -57,7 +58,7 @@ def pytest_xdist_setupnodes(config: pytest.Config) -> None:
 def _runs_on_torch_again(item: pytest.Function) -> bool:
     """Whether this is the numba variant of a test in float64, of a GPU, or of torch alone."""
     values = getattr(getattr(item, "callspec", None), "params", {})
-    if values.get("each_backend") != "numba":
+    if "numba" not in (values.get("each_backend"), values.get("each_device")):
         return False
     double = any(
         value in ("float64", torch.float64) for value in values.values() if isinstance(value, str | torch.dtype)
@@ -74,9 +75,34 @@ def each_backend(request: pytest.FixtureRequest) -> Iterator[str]:
         yield request.param
 
 
-@pytest.fixture(params=[b.name for b in backends.BACKENDS if "cpu" in (b.devices or ()) and b.is_installed()])
-def kernel_backend(request: pytest.FixtureRequest) -> str:
-    """The name of each backend of kernels for CPUs, for tests that compare it with torch in float64."""
+@pytest.fixture(scope="module", params=["torch", "numba", pytest.param("cuda", marks=CARD)])
+def each_device(request: pytest.FixtureRequest) -> Iterator[torch.device]:
+    """Run a test as `each_backend` does, and on a card: the device."""
+    if request.param == "cuda":
+        yield torch.device("cuda")
+        return
+    skip_unless_there(Target(request.param))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(backends, "BACKENDS", tuple(b for b in backends.BACKENDS if b.name in ("torch", request.param)))
+        yield CPU
+
+
+@pytest.fixture(scope="session")
+def _fast_interpreter() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        speed_up_interpreter(patch)
+        yield
+
+
+@pytest.fixture(params=ALL_KERNELS)
+def kernels(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Target:
+    """Each backend of kernels where it runs, for tests that compare it with torch in float64."""
+    skip_unless_there(request.param)
+    if request.param.backend == "triton":
+        request.getfixturevalue("_fast_interpreter")
+    else:  # small pictures in as many pieces as large ones are
+        monkeypatch.setattr("kgs.backends.cpu.binning.MIN_ENTRIES", 1)
+        monkeypatch.setattr("kgs.backends.cpu.loss.MIN_PIXELS", 1)
     return request.param
 
 

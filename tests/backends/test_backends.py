@@ -1,11 +1,13 @@
-"""Backends: which one runs a call, and what a wrong name is told."""
+"""Backends: which one runs a call, what a wrong name is told, and that kernels agree with torch."""
 
 import pytest
 import torch
 from factories import random_camera, random_gaussians
+from targets import SELDOM_INTERPRETED
 
 import kgs
 from kgs import RasterOptions, backends
+from kgs.backends.agreement import BOUND, disagreement
 
 
 class Half(backends.TorchBackend):
@@ -84,3 +86,9 @@ def test_kernels_beside_the_renderer_are_numbas_unless_torch_is_named(half):
     assert not backends.takes_kernels("auto", "rows", rows.double())
     with pytest.raises(ValueError, match="backend: 'numba' does not cover this call of rows"):
         backends.takes_kernels("numba", "rows", rows.double())
+
+
+@SELDOM_INTERPRETED
+def test_a_training_step_of_kernels_agrees_with_torch(kernels):
+    backend = next(x for x in backends.BACKENDS if x.name == kernels.backend)
+    assert disagreement(backend, kernels.device) <= BOUND / 10

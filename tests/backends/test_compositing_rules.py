@@ -127,18 +127,3 @@ def test_twenty_thousand_layers(alpha):
     dark = light[:-1] < 1e-46
     assert not got[2][dark].any()
     assert not got[3][dark].any()
-
-
-@pytest.mark.parametrize("n", [1000, 20000])
-def test_transmittance_of_many_layers_is_accurate(n):
-    out = composite(
-        footprints([1 / 250] * n, size=(2, 2), dtype=torch.float32),
-        torch.ones(n, 1),
-        options=RasterOptions(tile_size=2),
-    )
-    exact = (1 - 1 / 250) ** n
-    if exact > 1e-4:
-        assert ((out.transmittance - exact) / exact).abs().max() <= 1e-5
-    else:
-        assert not out.transmittance.any()
-    assert (out.features - (1 - exact)).abs().max() <= STOP + 1e-5

@@ -13,7 +13,11 @@ from kgs import GaussianRenderer, RasterOptions, backends, composite, project
 from kgs.backends.torch import compositing
 from kgs.backends.torch.binning import bin_to_tiles
 
-pytestmark = pytest.mark.usefixtures("each_backend")
+
+@pytest.fixture(autouse=True)
+def _torch_alone(monkeypatch):
+    """The kernels have one size of tiles, and no chunks; some tests look inside the torch implementation."""
+    monkeypatch.setattr(backends, "BACKENDS", (backends.TorchBackend(),))
 
 
 def loss_and_gradients(projected, features, weights, **options):
@@ -28,18 +32,9 @@ def assert_gradients_close(got, expected, bound):
         assert (a.double() - b.double()).abs().max() <= bound * b.abs().max()
 
 
-@pytest.mark.usefixtures("torch_alone")  # the kernels have one size of tiles, and no chunks
-@pytest.mark.parametrize(
-    "sizes",  # of tiles and chunks
-    [
-        [(4, None), (5, 3), (8, 32), (64, 3)],
-        pytest.param([(8, 1), (8, 3), (8, 8), (16, 8), (32, 32), (64, None)], marks=pytest.mark.slow),
-    ],
-    ids=["default", "others"],
-)
 @pytest.mark.parametrize("thresholds", [(0.0, 0.0), (TH, STOP)])
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_tile_and_chunk_sizes_give_one_image_and_gradient(dtype, thresholds, sizes):
+def test_tile_and_chunk_sizes_give_one_image_and_gradient(dtype, thresholds):
     options = dict(zip(("alpha_threshold", "transmittance_stop"), thresholds, strict=True))
     gaussians = random_gaussians(300, 5, dtype, image_size=40)
     camera = random_camera(40, 56, 5, dtype)
@@ -51,7 +46,7 @@ def test_tile_and_chunk_sizes_give_one_image_and_gradient(dtype, thresholds, siz
     first, first_gradients = loss_and_gradients(
         projected, projected.colors, weights, tile_size=4, chunk_size=1, **options
     )
-    for tile_size, chunk_size in sizes:
+    for tile_size, chunk_size in ((4, None), (5, 3), (8, 32), (64, 3)):
         image, gradients = loss_and_gradients(
             projected, projected.colors, weights, tile_size=tile_size, chunk_size=chunk_size, **options
         )
@@ -75,7 +70,6 @@ def dense(means2d, factors, opacities, features, depths, size, eps2d):
     return torch.cat([sums, transmittance[-1:]]).view(1, -1, *size)
 
 
-@pytest.mark.usefixtures("torch_alone")  # in float64
 @pytest.mark.parametrize("chunk_size", [1, 3, None])
 @pytest.mark.parametrize("max_bytes", [2**30, 2**19])
 def test_tiles_that_end_at_different_depths(chunk_size, max_bytes):
@@ -103,13 +97,7 @@ def test_tiles_that_end_at_different_depths(chunk_size, max_bytes):
 
 
 @pytest.fixture
-def torch_alone(monkeypatch):
-    """For what looks inside the torch implementation."""
-    monkeypatch.setattr(backends, "BACKENDS", (backends.TorchBackend(),))
-
-
-@pytest.fixture
-def composited(monkeypatch, torch_alone):
+def composited(monkeypatch):
     """The depth slices that are composited from here on, and whether their alphas were kept."""
     slices, real = [], compositing.DepthSlice.composite
 
@@ -165,15 +153,7 @@ def test_alphas_made_again_are_those_that_were_kept(dtype, composited, monkeypat
     assert all(torch.equal(*pair) for pair in zip(lean_gradients, kept_gradients, strict=True))
 
 
-@pytest.mark.parametrize(
-    ("dtype", "bound", "tight"),
-    [
-        (torch.float32, 1e-6, False),
-        (torch.float64, 1e-13, True),
-        pytest.param(torch.float32, 1e-6, True, marks=pytest.mark.slow),
-        pytest.param(torch.float64, 1e-13, False, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("dtype", "bound", "tight"), [(torch.float32, 1e-6, False), (torch.float64, 1e-13, True)])
 @pytest.mark.parametrize(
     "thresholds", [*(pytest.param(pair, marks=pytest.mark.slow) for pair in ((0.0, 0.0), (TH, STOP))), (TH, 0.1)]
 )
@@ -201,7 +181,7 @@ def test_depth_slices_change_nothing(dtype, bound, thresholds, tight, composited
 
 
 @pytest.fixture
-def as_on_a_gpu(monkeypatch, torch_alone):
+def as_on_a_gpu(monkeypatch):
     """Scans and sizes of steps as a GPU gets them."""
     monkeypatch.setitem(compositing.SETTINGS, "cpu", compositing.SETTINGS["cuda"])
 

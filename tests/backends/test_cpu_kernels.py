@@ -1,12 +1,13 @@
 """What only the numba kernels have: lists in bands, vector code, one cache on the disk."""
 
 import dataclasses
+import itertools
 import re
 
 import numpy as np
 import pytest
 import torch
-from compositing_checks import TH, many_bands  # noqa: F401 - a fixture for all
+from compositing_checks import TH
 from kernel_checks import assembly, avx_assembly
 from tile_checks import scene
 
@@ -20,6 +21,12 @@ from kgs.backends.cpu import binning_kernels, loss_kernels, projection_kernels  
 from kgs.backends.cpu import compositing_kernels as kernels  # noqa: E402  # needs numba
 from kgs.backends.cpu.binning import TileCoverage  # noqa: E402  # needs numba
 from kgs.init_points import matching_kernels  # noqa: E402  # needs numba
+
+
+@pytest.fixture(autouse=True)
+def _many_bands(monkeypatch):
+    """Small pictures in as many bands as large ones are."""
+    monkeypatch.setattr("kgs.backends.cpu.binning.MIN_ENTRIES", 1)
 
 
 def coverage_of(projected, threshold=TH, max_spans=2**40):
@@ -52,14 +59,6 @@ def test_lists_are_those_of_torch(cameras, threshold, rows):
                 assert got.tolist() == expected[tile].tolist()
                 tile += 1
         assert tile == end * bins.grid[1]
-
-
-@pytest.mark.parametrize("max_spans", [2**40, 200, 1])
-def test_rows_hold_what_was_counted(max_spans):
-    projected = scene(0, cameras=2)
-    coverage, bins = coverage_of(projected, max_spans=max_spans), bin_to_tiles(projected)
-    assert torch.equal(torch.from_numpy(coverage.entries_per_row), bins.offsets.diff().reshape(-1, bins.grid[1]).sum(1))
-    assert coverage.spans_per_row.tolist() == [len(coverage.row_slice(row, row + 1).spans) for row in range(12)]
 
 
 def layers_of_a_chunk(seed, n):
@@ -104,15 +103,15 @@ def find_strips(rows, n, threshold):
 @pytest.mark.parametrize("threshold", [TH, 0.5, kernels.TINY])
 def test_strips_where_an_alpha_counts_are_found(threshold, n):
     missed = 0
-    for seed in range(100):
+    for seed in range(40):
         found, alphas = find_strips(layers_of_a_chunk(seed, n), n, threshold)
         assert not alphas[~found].any()
         missed += (~found).sum()
-    assert missed > 50 * n  # of 400 n
+    assert missed > 20 * n  # of 160 n
 
 
 def test_strips_are_found_that_are_reached_by_a_rounding():
-    for seed in range(300):
+    for seed in range(100):
         rows = layers_of_a_chunk(seed, kernels.K)
         rows[:, 0] = 0.0
         _, alphas = find_strips(rows, kernels.K, kernels.TINY)
@@ -132,13 +131,12 @@ def test_a_strip_beside_the_ellipse_is_not_found():
     assert found.tolist() == [[True, True, False, False], [False] * 4, [False, True, True, False]]
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 3e38, -3e38])
-@pytest.mark.parametrize("column", range(7))
-def test_strips_are_found_whatever_is_not_finite(column, bad):
-    rows = layers_of_a_chunk(0, kernels.K)
-    rows[:, column] = bad
-    found, alphas = find_strips(rows, kernels.K, TH)
-    assert not alphas[~found].any()
+def test_strips_are_found_whatever_is_not_finite():
+    for column, bad in itertools.product(range(7), (np.nan, np.inf, -np.inf, 3e38, -3e38)):
+        rows = layers_of_a_chunk(0, kernels.K)
+        rows[:, column] = bad
+        found, alphas = find_strips(rows, kernels.K, TH)
+        assert not alphas[~found].any()
 
 
 FLOATS = r"(?:fn?m(?:add|sub)\d*|mul|add|sub)"

@@ -131,11 +131,6 @@ def test_opacity_zero_or_below_the_threshold_is_in_no_tile(threshold):
     assert got[2::3].any()
 
 
-def test_opacities_above_one_reach_farther():
-    assert bin_to_tiles(dots([6.0, 3.0], (8, 16), 0.99)).offsets.tolist() == [0, 1, 1]
-    assert bin_to_tiles(dots([6.0, 3.0], (8, 16), 5.0)).offsets.tolist() == [0, 1, 2]
-
-
 def test_many_ties_and_negative_depths():
     projected = scene(0, n=300)
     for depths in ((projected.depths * 2).round(), -projected.depths, torch.zeros_like(projected.depths)):

@@ -22,16 +22,6 @@ def test_other_camera_models_with_nothing_visible_or_no_gradient_asked_for(kind)
     assert all((grad == 0).all() for grad in grads.values())
 
 
-@pytest.mark.parametrize("degree", [None, 2])
-@pytest.mark.parametrize("opacity_rows", [None, 3])
-def test_no_gaussians_at_all(opacity_rows, degree):
-    gaussians, cameras = scene(0, degree, cameras=3)
-    if opacity_rows:
-        gaussians = replace(gaussians, opacities=torch.zeros(opacity_rows, 0, dtype=torch.float64))
-    got = project(gaussians, cameras)
-    assert (len(got), got.num_cameras, got.num_gaussians, got.num_nonfinite.item()) == (0, 3, 0, 0)
-
-
 def packed(gaussians, cameras):
     """All outputs in one vector: gradcheck would skip an output that lost its graph."""
     got = project(gaussians, cameras)
@@ -39,7 +29,7 @@ def packed(gaussians, cameras):
     return torch.cat([field.flatten() for field in fields])
 
 
-@pytest.mark.parametrize("degree", [None, 0, 3])
+@pytest.mark.parametrize("degree", [None, 1])
 def test_gradcheck_with_respect_to_the_gaussians(degree):
     gaussians, cameras = scene(2, degree, cameras=2)
     leaves = [getattr(gaussians, name).requires_grad_() for name in FIELDS]
@@ -54,7 +44,7 @@ def inner(gaussians):
 @pytest.mark.parametrize("beyond", [0, 3])
 def test_gradcheck_with_respect_to_extrinsics_and_intrinsics(beyond):
     """Also of Gaussians beyond the limits of the Jacobian, which follow the intrinsics."""
-    gaussians, cameras = scene(3, 2, cameras=2)
+    gaussians, cameras = scene(3, 1, cameras=2)
     means = inner(gaussians).means
     means[:beyond] += torch.tensor([[-7.0, 0, 0], [0, 4.5, 0], [6.0, -5.0, 0]], dtype=torch.float64)[:beyond]
     gaussians = replace(gaussians, means=means, scales=gaussians.scales * (20 if beyond else 1))

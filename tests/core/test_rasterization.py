@@ -82,20 +82,6 @@ def test_renders_are_those_of_the_renderer(half, dtype, bound):
     assert (meta["width"], meta["height"], meta["tile_size"], meta["n_cameras"]) == (32, 24, 8, 2)
 
 
-@pytest.mark.parametrize("camera", [0, 1])
-def test_a_colour_of_one_camera_that_is_not_finite_leaves_its_gaussian_out(camera):
-    gaussians, cameras = scene(dtype=torch.float32)
-    features = torch.rand(2, 60, 3, generator=torch.Generator().manual_seed(0))
-    rest = torch.arange(60) != 7
-    expected, _, _ = call(gaussians[rest], cameras, colors=features[:, rest])
-    features[camera, 7, 0] = torch.nan
-    features.requires_grad_()
-    renders, _, _ = call(gaussians, cameras, colors=features)
-    assert torch.allclose(renders, expected, atol=1e-5)
-    renders.sum().backward()
-    assert features.grad.isfinite().all()
-
-
 REFUSED = {
     "rasterize_mode": ["sharp"],
     "sparse_grad": [True],
@@ -317,28 +303,6 @@ def test_features_of_no_width_in_a_batch():
     views = {"viewmats": torch.stack([cameras.extrinsics] * 2), "Ks": torch.stack([cameras.intrinsics[:, :3, :3]] * 2)}
     renders, _, _ = rasterization(**values, **views, width=32, height=24, render_mode="RGB+D")
     assert renders.shape == (2, 2, 24, 32, 1)
-
-
-def covariances(gaussians):
-    turned = quaternion_to_rotation_matrix(gaussians.quats) * gaussians.scales[:, None]
-    return turned @ turned.mT
-
-
-@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
-@pytest.mark.parametrize("index", [(0, 1), (0, 0), (1, 1), (2, 2)])
-def test_a_covariance_that_is_not_finite_is_left_out_and_its_gradient_is_0(value, index):
-    gaussians, cameras = scene(dtype=torch.float32)
-    covars = covariances(gaussians)
-    rest = torch.arange(60) != 7
-    expected = call(gaussians[rest], cameras, covars=covars[rest], quats=None, scales=None)[0]
-    covars[7][index] = value
-    covars.requires_grad_()
-    renders = call(gaussians, cameras, covars=covars, quats=None, scales=None)[0]
-    assert torch.allclose(renders, expected, atol=1e-5)
-    renders.square().sum().backward()
-    assert not covars.grad[7].any()
-    assert covars.grad.isfinite().all()
-    assert covars.grad[rest].any()
 
 
 @pytest.mark.parametrize("packed", [True, False])

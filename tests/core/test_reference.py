@@ -7,7 +7,6 @@ import torch
 from factories import pinhole, random_camera, random_gaussians, replace
 from oracles import mpmath_pixels
 from reference_checks import EXACT, RED, SMALL, stack, tensor
-from torch import Tensor
 
 from kgs import Gaussians
 from kgs.reference import layers, render
@@ -74,50 +73,6 @@ def test_fifty_digits_beyond_the_tangent_limits():
     expected = tensor(*mpmath_pixels(gaussians, camera, pixels))
     assert float(expected.max()) > 0.1
     assert float((torch.stack([image[:, r, c] for r, c in pixels]) - expected).abs().max()) < 1e-13
-
-
-def harmonics_at(direction: Tensor, degree: int = 3) -> Tensor:
-    """The basis as the renderer sees it: the colours of one coefficient each, seen along `direction`."""
-    direction = direction / direction.norm()
-    frame = torch.linalg.qr(torch.stack([direction, tensor(0.3, -0.5, 0.8), tensor(-0.6, 0.2, 0.7)], 1)).Q
-    extrinsics = torch.eye(4, dtype=torch.float64)
-    extrinsics[:3, :3] = torch.stack([frame[:, 1], frame[:, 2], direction])
-    eye = tensor(0.4, -1.0, 2.0)
-    extrinsics[:3, 3] = -extrinsics[:3, :3] @ eye
-    size = (degree + 1) ** 2
-    colors = 0.3 * torch.eye(size, dtype=torch.float64)[:, :, None].expand(size, size, 3)
-    gaussians = Gaussians(
-        (eye + 2.5 * direction).expand(size, 3),
-        tensor([1, 0, 0, 0]).expand(size, 4),
-        torch.ones(size, 3).double(),
-        torch.ones(size).double(),
-        colors,
-    )
-    rgb = layers(gaussians, pinhole(3, 3, 5, extrinsics=extrinsics)).colors
-    return (rgb[:, 0] - 0.5) / 0.3
-
-
-def test_harmonics_have_the_order_and_signs_of_ply_files():
-    x, y, z = (tensor(0.48, -0.6, 0.64)).tolist()
-    expected = [
-        0.28209479177387814,
-        -0.4886025119029199 * y,
-        0.4886025119029199 * z,
-        -0.4886025119029199 * x,
-        1.0925484305920792 * x * y,
-        -1.0925484305920792 * y * z,
-        0.31539156525252005 * (2 * z * z - x * x - y * y),
-        -1.0925484305920792 * x * z,
-        0.5462742152960396 * (x * x - y * y),
-        -0.5900435899266435 * y * (3 * x * x - y * y),
-        2.890611442640554 * x * y * z,
-        -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
-        0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
-        -0.4570457994644658 * x * (4 * z * z - x * x - y * y),
-        1.445305721320277 * z * (x * x - y * y),
-        -0.5900435899266435 * x * (x * x - 3 * y * y),
-    ]
-    torch.testing.assert_close(harmonics_at(tensor(x, y, z)), tensor(*expected), rtol=0, atol=1e-14)
 
 
 def test_negative_colours_become_black_and_pass_no_gradient():

@@ -63,16 +63,6 @@ def test_alpha_is_clamped_at_099_with_the_clamps_gradient(opacity, slope):
     assert opacities.grad.item() == slope
 
 
-def test_alpha_below_the_threshold_is_skipped():
-    drawn = stack([1 / 256, 0.5, 1 / 254], [RED, GREEN, BLUE], scale=1e9)
-    image = render(drawn, SMALL, transmittance_stop=0.0)
-    torch.testing.assert_close(image[0, :, 1, 1], tensor(0.0, 0.5, 0.5 / 254), rtol=0, atol=1e-12)
-    image = render(drawn, SMALL, alpha_threshold=0.0, transmittance_stop=0.0)
-    torch.testing.assert_close(
-        image[0, :, 1, 1], tensor(1 / 256, 0.5 * 255 / 256, 0.5 * 255 / 256 / 254), atol=1e-12, rtol=0
-    )
-
-
 def test_alpha_at_the_threshold_is_drawn():
     assert float(render(one([0, 0, 2], [0.1] * 3, 0.25), pinhole(3, 3, 50), None, 0.25)[0, 0, 1, 1]) == 0.25
 

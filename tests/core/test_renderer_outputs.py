@@ -6,10 +6,9 @@ import math
 import pytest
 import torch
 from factories import leaves, one_gaussian, pinhole, posed, random_camera, random_gaussians, random_scene, replace
-from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from kornia.sensors.camera import CameraModelType
 
-import kgs.reference
+import kgs
 from kgs import GaussianRenderer
 from kgs.renderer import blend
 
@@ -19,34 +18,12 @@ EXACT = {"alpha_threshold": 0.0, "transmittance_stop": 0.0}
 SIZE = (24, 32)
 
 
-def shortest_axes(gaussians, centre):
-    """Towards `centre`, one by one."""
-    found = []
-    for mean, quat, scales in zip(gaussians.means, gaussians.quats, gaussians.scales, strict=True):
-        axis = quaternion_to_rotation_matrix((quat / quat.norm())[None])[0][:, int(scales.argmin())]
-        found.append(axis if axis @ (centre - mean) > 0 else -axis)
-    return torch.stack(found)
-
-
-@pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 2e-5), (torch.float64, 1e-11)])
-def test_normals_are_what_the_weights_of_the_reference_say(dtype, bound):
-    gaussians, camera = random_scene(0, dtype, 60, SIZE)
-    drawn = kgs.reference.layers(gaussians, camera, **EXACT)
-    exact, pose = gaussians.to(torch.float64), camera.extrinsics[0].double()
-    axes = shortest_axes(exact, -pose[:3, :3].T @ pose[:3, 3])
-    expected = torch.einsum("lhw,lc->chw", drawn.weights, axes[drawn.order])
-    out = GaussianRenderer(**EXACT)(gaussians, camera, outputs=("normal",))
-    assert out.image is None
-    assert out.normal.dtype == dtype
-    assert (out.normal[0] - expected).abs().max() <= bound
-
-
 def test_a_disk_shows_its_face_whatever_side_the_camera_is_on():
     half = math.radians(20) / 2
     tilted = (math.cos(half), 0.0, math.sin(half), 0.0)  # about y
     disk = one_gaussian((5.0, 5.0, 0.01), tilted, (0.0, 0.0, 4.0), 0.9)
     for flipped in (False, True):
-        pose = torch.diag(torch.tensor([1.0, 1.0, 1.0, 1.0])).double()
+        pose = torch.eye(4, dtype=torch.float64)
         if flipped:  # from behind, looking back
             pose = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])).double()
             pose[2, 3] = 8.0
@@ -64,14 +41,10 @@ def test_normals_with_parallel_rays_are_turned_against_them():
     assert drawn.abs().max() > 0.1
 
 
-def test_normals_beside_other_outputs_change_none_of_them_and_have_gradients():
+def test_normals_have_gradients():
     gaussians, camera = random_scene(0, torch.float32, 60, SIZE, cameras=2)
     given, inputs = leaves(gaussians)
-    names = ("image", "alpha", "depth", "median_depth")
-    alone, joint = (GaussianRenderer()(given, camera, outputs=o) for o in (names, (*names, "normal")))
-    for name in names:
-        assert torch.equal(getattr(alone, name), getattr(joint, name))
-    joint.normal.square().sum().backward()
+    GaussianRenderer()(given, camera, outputs=("image", "normal")).normal.square().sum().backward()
     assert all(x.grad.isfinite().all() for x in inputs[:4])
     assert inputs[1].grad.any()
 

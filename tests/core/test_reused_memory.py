@@ -3,6 +3,7 @@
 import os
 import signal
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -23,22 +24,17 @@ def nothing_is_free(monkeypatch):
     monkeypatch.setattr(kgs._support.memory, "_free", [])
 
 
-def test_memory_of_an_array_that_is_gone_is_used_again():
+@pytest.mark.parametrize(
+    "keep",
+    [None, lambda values: values[10:], torch.from_numpy, lambda values: torch.from_numpy(values)[:, 3]],
+    ids=["nothing", "view", "tensor", "part of a tensor"],
+)
+def test_memory_is_used_again_unless_it_is_still_seen(keep):
     first = array(LARGE)
     where = address(first)
+    kept = keep(first) if keep else None
     del first
-    assert address(array((900, 100))) == where
-
-
-@pytest.mark.parametrize("keep", ["view", "tensor", "part of a tensor"])
-def test_memory_that_is_still_seen_is_not_used_again(keep):
-    first = array(LARGE)
-    where = address(first)
-    kept = {"view": first[10:], "tensor": torch.from_numpy(first), "part of a tensor": torch.from_numpy(first)[:, 3]}[
-        keep
-    ]
-    del first
-    assert address(array(LARGE)) != where
+    assert (address(array((900, 100))) == where) is (keep is None)
     del kept
 
 
@@ -54,21 +50,15 @@ def test_arrays_have_the_shape_and_begin_at_a_cache_line(shape, dtype):
 
 
 def test_threads_do_not_get_the_same_memory():
-    results = []
-
     def work(number):
         for _ in range(50):
             values = array(LARGE)
             values[:] = number
-            results.append(bool((values == number).all()))
+            assert (values == number).all()
+        return number
 
-    threads = [threading.Thread(target=work, args=(i,)) for i in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert all(results)
-    assert len(results) == 200
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(work, range(4))) == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.int64])

@@ -3,24 +3,16 @@
 import dataclasses
 
 import factories
-import pytest
 import torch
 from factories import random_camera, random_gaussians, staged
 from oracles import near_threshold
+from targets import TORCH
 
 from kgs import RasterOptions, composite, project
 
 TH, STOP = 1 / 255, 1e-4
 EXACT = RasterOptions(alpha_threshold=0.0, transmittance_stop=0.0)
-
-
 DTYPES = [torch.float32, torch.float64]
-
-
-@pytest.fixture(autouse=True)
-def many_bands(monkeypatch):
-    """Small pictures in many bands, as large ones are: in each file of tests that imports it."""
-    monkeypatch.setattr("kgs.backends.cpu.binning.MIN_ENTRIES", 1)
 
 
 def drawn(n=300, size=(40, 56)):
@@ -62,7 +54,7 @@ def scene_footprints(n, seed, dtype, size=(40, 56), **kwargs):
     return projected, projected.colors, weights
 
 
-# -- one backend against another -----------------------------------------------------------------------------------
+# -- kernels against torch -------------------------------------------------------------------------------------------
 
 THRESHOLDS = [(TH, STOP), (0.0, 0.0), (TH, 0.1)]
 
@@ -77,21 +69,28 @@ def random(*shape, seed=0):
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
-def outcome(projected, features, certain, dtype=torch.float64, wanted=(True,) * 4, backend="torch", **options):
-    """Sums, light, median depth and the gradients of a loss over the pixels that are certain."""
-    options = {"backend": backend, "median_depth": True} | options
-    values = {k: getattr(projected, k).to(dtype) for k in ("means2d", "factors", "opacities", "depths")}
-    projected, inputs = leaves(dataclasses.replace(projected, **values), features.to(dtype))
+def outcome(projected, features, certain=None, target=TORCH, dtype=torch.float32, wanted=(True,) * 4, **options):
+    """Sums, light, median depth and the gradients of a loss over the pixels that are certain, all on the CPU."""
+    projected, inputs = leaves(target.move(projected, dtype), target.move(features, dtype))
     for x, needed in zip(inputs, wanted, strict=True):
         x.requires_grad_(needed)
-    out = composite(projected, inputs[-1], **staged(**options))
+    given = {"backend": target.backend, "median_depth": True} | staged(**options)
+    out = composite(projected, inputs[-1], **given)
     image = torch.cat([out.features, out.transmittance], 1)
-    loss = (image * (random(*image.shape) * certain).to(dtype)).sum()
+    weights = random(*image.shape) * (1 if certain is None else certain)
+    loss = (image * weights.to(image)).sum()
     gradients = torch.autograd.grad(loss, [x for x in inputs if x.requires_grad])
-    return [x.detach() for x in (out.features, out.transmittance, out.median_depth)], gradients
+    images = (out.features, out.transmittance, out.median_depth)
+    return [x.detach().cpu() for x in images], [x.cpu() for x in gradients]
 
 
-def assert_close(got, expected, certain, bound=1e-5, image_bound=2e-6):
+def exact(projected, features, certain=None, **options):
+    """What torch says in float64."""
+    return outcome(projected, features, certain, dtype=torch.float64, **options)
+
+
+def assert_close(got, expected, certain=None, bound=1e-5, image_bound=2e-6):
+    certain = torch.ones(()) if certain is None else certain
     (*images, median), (*expected_images, expected_median) = got[0], expected[0]
     for a, b in zip(images, expected_images, strict=True):
         assert a.shape == b.shape

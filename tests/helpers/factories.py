@@ -262,9 +262,9 @@ def drop_layer(progress: float, **options: Any) -> DropGaussian:
 
 
 @contextlib.contextmanager
-def other_defaults(dtype: torch.dtype = torch.float64) -> Iterator[None]:
+def other_defaults(dtype: torch.dtype = torch.float64, device: str | None = "meta") -> Iterator[None]:
     """Torch's default device is "meta", which stands for an accelerator, and its default dtype another."""
-    torch.set_default_device("meta")
+    torch.set_default_device(device)
     torch.set_default_dtype(dtype)
     try:
         yield

@@ -1,13 +1,13 @@
 """What tests of projection have in common."""
 
 import torch
-from factories import FIELDS, batch, leaves, random_camera, random_gaussians, replace, staged
+from factories import FIELDS, batch, random_camera, random_gaussians, replace, staged
+from kornia.geometry.camera import PinholeCamera
+from targets import CPU, TORCH, move
 
 from kgs import Gaussians, project
 
 HEIGHT, WIDTH = 48, 64
-
-
 PACKED = ("means2d", "factors", "depths", "radii", "opacities", "colors")
 
 
@@ -51,7 +51,7 @@ def values_and_gradients(gaussians, cameras):
     return got, {name: leaf.grad for name, leaf in leaves.items()}
 
 
-# -- one backend against another -----------------------------------------------------------------------------------
+# -- kernels against torch -------------------------------------------------------------------------------------------
 
 DIFFERENTIABLE = ("means2d", "factors", "depths", "opacities", "colors")
 
@@ -65,60 +65,43 @@ def wide_scene(degree=2, n=400, cameras=1):
     return replace(gaussians, means=means), cameras
 
 
-def list_and_gradients(gaussians, cameras, backend, dtype=torch.float32, **options):
-    """The list, and the gradients of a sum of its values with random weights."""
-    gaussians, inputs = leaves(gaussians.to(dtype))
-    cameras = type(cameras)(
-        *(x.to(dtype) for x in (cameras.intrinsics, cameras.extrinsics)), cameras.height, cameras.width
-    )
-    got = project(gaussians, cameras, backend=backend, **staged(**options))
-    fields = [getattr(got, name) for name in DIFFERENTIABLE]
+def list_and_gradients(gaussians, cameras, target=TORCH, dtype=torch.float32, wanted=FIELDS, **options):
+    """The list, and the gradients of a sum of its values with random weights, both on the CPU.
+
+    `wanted` are those of the fields, and of "extrinsics" and "intrinsics", that have a gradient.
+    """
+    matrices = {name: getattr(cameras, name) for name in ("extrinsics", "intrinsics")}
+    inputs = {name: target.move(x, dtype).clone() for name, x in (vars(gaussians) | matrices).items()}
+    for name in wanted:
+        inputs[name].requires_grad_()
+    height, width = target.move(cameras.height), target.move(cameras.width)
+    seen = PinholeCamera(inputs["intrinsics"], inputs["extrinsics"], height, width)
+    fields = Gaussians(*(inputs[name] for name in FIELDS))
+    got = project(fields, seen, backend=target.backend, **staged(**options))
+    values = [getattr(got, name) for name in DIFFERENTIABLE]
     generator = torch.Generator().manual_seed(1)
-    weights = [torch.randn(x.shape, generator=generator, dtype=torch.float64).to(dtype) for x in fields]
-    used = [(x, w) for x, w in zip(fields, weights, strict=True) if x.requires_grad]
+    weights = [torch.randn(x.shape, generator=generator, dtype=torch.float64).to(x) for x in values]
+    used = [(x, w) for x, w in zip(values, weights, strict=True) if x.requires_grad]
     torch.autograd.backward(*zip(*used, strict=True))
-    return got, dict(zip(FIELDS, (x.grad for x in inputs), strict=True))
+    grads = {name: None if x.grad is None else x.grad.cpu() for name, x in inputs.items()}
+    graphs = {name: getattr(got, name).requires_grad for name in DIFFERENTIABLE}
+    return move(got, CPU), grads, graphs
 
 
-def assert_alike(gaussians, cameras, backend, accuracy=3e-6, **options):
+def assert_alike(gaussians, cameras, target, wanted=FIELDS, accuracy=3e-6, **options):
     """The list of torch in float32, and what torch says in float64."""
-    got, grads = list_and_gradients(gaussians, cameras, backend, **options)
-    listed, same = list_and_gradients(gaussians, cameras, "torch", **options)
-    exact, exact_grads = list_and_gradients(gaussians, cameras, "torch", torch.float64, **options)
+    got, grads, graphs = list_and_gradients(gaussians, cameras, target, wanted=wanted, **options)
+    listed, same, same_graphs = list_and_gradients(gaussians, cameras, wanted=wanted, **options)
+    exact, exact_grads, _ = list_and_gradients(gaussians, cameras, TORCH, torch.float64, wanted, **options)
     for name in ("camera_ids", "gaussian_ids", "num_nonfinite", "radii"):
         assert torch.equal(getattr(got, name), getattr(listed, name)), name
         assert getattr(got, name).dtype == getattr(listed, name).dtype
     assert (got.image_size, got.num_cameras, got.num_gaussians) == (exact.image_size, exact.num_cameras, len(gaussians))
+    assert graphs == same_graphs
+    assert {name for name, x in grads.items() if x is None} == {name for name, x in same.items() if x is None}
     pairs = [(name, getattr(got, name), getattr(exact, name)) for name in DIFFERENTIABLE]
-    for name, x, y in pairs + [(name, grads[name], exact_grads[name]) for name in FIELDS]:
-        if y is None:
-            assert x is None, name
-            continue
+    for name, x, y in pairs + [(name, x, exact_grads[name]) for name, x in grads.items() if x is not None]:
         assert x.shape == y.shape, name
         assert x.dtype == torch.float32
         assert x.numel() == 0 or (x - y).abs().max() <= accuracy * y.abs().max(), name
-    assert [getattr(got, n).requires_grad for n in DIFFERENTIABLE] == [
-        getattr(listed, n).requires_grad for n in DIFFERENTIABLE
-    ]
-    assert [grads[name] is None for name in FIELDS] == [same[name] is None for name in FIELDS]
     return got, grads
-
-
-def assert_camera_gradients(gaussians, cameras, backend, wanted):
-    """Gradients of "pose", "lens" and "Gaussians", as far as they are wanted: what torch says in float64."""
-    found = []
-    for name, dtype in ((backend, torch.float32), ("torch", torch.float64)):
-        matrices = {"pose": cameras.extrinsics, "lens": cameras.intrinsics}
-        leaf = {part: x.to(dtype).clone().requires_grad_(part in wanted) for part, x in matrices.items()}
-        values, inputs = leaves(gaussians.to(dtype)) if "Gaussians" in wanted else (gaussians.to(dtype), [])
-        seen = type(cameras)(leaf["lens"], leaf["pose"], cameras.height, cameras.width)
-        fields = [getattr(project(values, seen, backend=name), field) for field in DIFFERENTIABLE]
-        generator = torch.Generator().manual_seed(2)
-        weights = [torch.randn(x.shape, generator=generator, dtype=torch.float64).to(dtype) for x in fields]
-        used = [(x, w) for x, w in zip(fields, weights, strict=True) if x.requires_grad]
-        torch.autograd.backward(*zip(*used, strict=True))
-        found.append(([x.requires_grad for x in fields], [x.grad for x in (*leaf.values(), *inputs)]))
-    assert found[0][0] == found[1][0]
-    for got, exact in zip(found[0][1], found[1][1], strict=True):
-        assert (got is None) == (exact is None)
-        assert got is None or (got - exact).abs().max() <= 3e-6 * exact.abs().max()

@@ -49,6 +49,14 @@ def gradients(inputs, seed=0, **options):
 # --- finite differences -----------------------------------------------------------------------------------------
 
 
+def check_each_input(run, inputs, seed=0):
+    """Along one random direction for each input, the others constant."""
+    for i in range(len(inputs)):
+        values = [x if i == j else x.detach() for j, x in enumerate(inputs)]
+        torch.manual_seed(seed)
+        assert torch.autograd.gradcheck(run, values, eps=1e-6, atol=1e-6, rtol=1e-5, fast_mode=True), INPUTS[i]
+
+
 @pytest.mark.parametrize("sh_degree", [3, None])
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 5))])
 def test_gradcheck_of_the_whole_pipeline_along_random_directions(seed, sh_degree):
@@ -58,11 +66,7 @@ def test_gradcheck_of_the_whole_pipeline_along_random_directions(seed, sh_degree
         out = render(values, outputs=("image", "alpha", "depth"), **EXACT)
         return out.image, out.alpha, out.depth
 
-    # fast mode: one random direction an input, so each input on its own, the others constant
-    for i in range(len(inputs)):
-        values = [x if i == j else x.detach() for j, x in enumerate(inputs)]
-        torch.manual_seed(seed)
-        assert torch.autograd.gradcheck(run, values, eps=1e-6, atol=1e-6, rtol=1e-5, fast_mode=True), INPUTS[i]
+    check_each_input(run, inputs, seed)
 
 
 @pytest.mark.slow
@@ -93,10 +97,7 @@ def test_gradcheck_of_other_lenses(kind, params):
         camera = PosedCamera(CameraModel(ImageSize(*SIZE), kind, values[6]), values[5])
         return GaussianRenderer(**EXACT)(Gaussians(*values[:5]), camera, values[7]).image
 
-    for i in range(len(inputs)):
-        values = [x if i == j else x.detach() for j, x in enumerate(inputs)]
-        torch.manual_seed(0)
-        assert torch.autograd.gradcheck(run, values, eps=1e-6, atol=1e-6, rtol=1e-5, fast_mode=True), INPUTS[i]
+    check_each_input(run, inputs)
 
 
 @pytest.mark.parametrize("h", [1e-3, 0.04, 0.5])
@@ -124,20 +125,13 @@ def test_one_step_of_any_length_is_the_derivative(name, h, seed):
 
 @pytest.mark.parametrize("options", [EXACT, {}])
 @pytest.mark.parametrize("seed", range(3))
-def test_moving_the_world_is_moving_the_camera(seed, options):
+def test_moving_the_world_is_moving_the_camera_and_scaling_both_changes_nothing(seed, options):
     inputs = make_inputs(seed, n=30, size=(24, 24))
     found = gradients(inputs, size=(24, 24), **options)
     rotation = inputs[5][0, :3, :3].detach()
     moved = found[0].sum(0)
     assert moved.abs().max() > 1e-3
     assert (moved - rotation.T @ found[5][0, :3, 3]).abs().max() <= 1e-10 * found[0].abs().sum()
-
-
-@pytest.mark.parametrize("options", [EXACT, {}])
-@pytest.mark.parametrize("seed", range(3))
-def test_scaling_the_world_changes_nothing(seed, options):
-    inputs = make_inputs(seed, n=30, size=(24, 24))
-    found = gradients(inputs, size=(24, 24), **options)
     terms = [(inputs[i] * found[i]).sum() for i in (0, 2)]
     terms.append((inputs[5] * found[5])[0, :3, 3].sum())
     assert max(abs(term) for term in terms) > 1e-2
@@ -199,23 +193,6 @@ def test_backward_twice():
         torch.autograd.grad(loss, inputs)
 
 
-def test_functional_gradients_are_right_or_refused():
-    inputs = make_inputs(0)
-    expected = torch.autograd.grad(render(inputs).image.sum(), inputs[0])[0]
-
-    def loss(means):
-        return render([means, *(x.detach() for x in inputs[1:])]).image.sum()
-
-    try:
-        found = torch.func.grad(loss)(inputs[0].detach())
-    except RuntimeError as refused:
-        error = str(refused)
-    else:
-        error = "" if torch.allclose(found, expected) else "wrong"
-    refusals = ("setup_context", "functorch", "Tensor that doesn't have storage")  # the last: torch 2.6
-    assert error == "" or any(words in error for words in refusals)
-
-
 @pytest.mark.parametrize("name", INPUTS)
 def test_editing_an_input_before_backward_is_never_silently_wrong(name):
     inputs = make_inputs(0)
@@ -259,11 +236,3 @@ def test_every_subset_of_inputs_gets_the_same_values():
                     assert torch.equal(x.grad, expected[name]), (name, names)
                 else:
                     assert x.grad is None
-
-
-def test_gradients_through_alpha_alone_and_depth_alone():
-    inputs = make_inputs(1, n=20, size=(16, 16))
-    for outputs in (("alpha",), ("depth",)):
-        out = render(inputs, size=(16, 16), outputs=outputs)
-        found = torch.autograd.grad(getattr(out, outputs[0]).sum(), inputs[:4])
-        assert all(x.isfinite().all() and x.any() for x in found)

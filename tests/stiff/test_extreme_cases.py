@@ -15,10 +15,7 @@ from kgs.bench import extremes as module
 from kgs.bench.extremes import SCENES, cases, errors, extremes
 from kgs.bench.scenes import Scene
 
-pytestmark = pytest.mark.usefixtures("each_backend")
 
-
-@pytest.mark.usefixtures("torch_alone")
 def test_every_scene_has_its_line() -> None:
     assert [case["case"] for case in cases()] == list(SCENES)
 
@@ -44,14 +41,13 @@ def _one_reference_for_all_backends() -> Iterator[None]:
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("case", cases(), ids=lambda case: case["case"])
-def test_every_bound_is_met(case: dict[str, object], dtype: str) -> None:
-    row = errors(case, dtype)
+def test_every_bound_is_met(case: dict[str, object], dtype: str, each_device: torch.device) -> None:
+    row = errors(case, dtype, each_device)
     assert row["verdict"] == "met", row
     assert math.isfinite(row["forward"])
     assert math.isfinite(row["gradient"])
 
 
-@pytest.mark.usefixtures("torch_alone")
 def test_files_lines_and_a_missed_bound(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -71,7 +67,6 @@ def test_files_lines_and_a_missed_bound(
     assert extremes(out=tmp_path / "new") == 0
 
 
-@pytest.mark.usefixtures("torch_alone")
 def test_an_error_that_is_not_a_number_misses_its_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     def spoilt(*args: object, **options: object) -> object:
         image, gradients = render(*args, **options)

@@ -1,9 +1,14 @@
-"""The promise of `max_bytes`, measured: the resident memory of a process of its own."""
+"""The promise of `max_bytes`, measured: the resident memory of a process of its own, and the memory of a card."""
 
 import subprocess
 import sys
 
 import pytest
+import torch
+from factories import leaves, random_scene
+from targets import move
+
+from kgs import GaussianRenderer
 
 PROGRAM = """
 import sys
@@ -52,3 +57,21 @@ def test_a_call_stays_within_max_bytes_for_tall_gaussians(mebibytes):
     done = subprocess.run(run, capture_output=True, text=True, check=True)
     beside = 15000 * 4 * (14 + 2 * 14 + 40) / 2**20 + 256 * 1024 * 4 * 20 / 2**20  # numbers per Gaussian, per pixel
     assert float(done.stdout) <= mebibytes + beside
+
+
+def test_max_bytes_bounds_the_memory_of_a_device_and_keeps_the_image(each_device):
+    gaussians, camera = random_scene(8, torch.float32, 4000, (256, 320), None)
+    bound, found = 24 * 2**20, []
+    for max_bytes in (2**30, bound):
+        given, inputs = leaves(move(gaussians, each_device))
+        if each_device.type == "cuda":
+            torch.cuda.empty_cache()
+            torch.cuda.reset_peak_memory_stats()
+            held = torch.cuda.memory_allocated()
+        image = GaussianRenderer(max_bytes=max_bytes)(given, move(camera, each_device)).image
+        found.append([image, *torch.autograd.grad(image.square().sum(), inputs)])
+    if each_device.type == "cuda":
+        beside = 4000 * 4 * 120 + 256 * 320 * 4 * 40  # numbers per Gaussian, per pixel
+        assert torch.cuda.max_memory_allocated() - held <= bound + beside
+    for (got, expected), error in zip(zip(*reversed(found), strict=True), (1e-5, *[1e-3] * 5), strict=True):
+        assert (got - expected).abs().max() <= error * expected.abs().max()

@@ -1,0 +1,225 @@
+"""Compositing of kernels: what torch gives in float64."""
+
+import dataclasses
+import math
+import weakref
+
+import pytest
+import torch
+from compositing_checks import (
+    TH,
+    THRESHOLDS,
+    assert_close,
+    exact,
+    footprints,
+    leaves,
+    outcome,
+    random,
+    sample,
+)
+from factories import batch, random_camera, random_gaussians
+from targets import SELDOM_INTERPRETED, TORCH, Target
+
+from kgs import RasterOptions, composite, project
+from kgs.backends.gpu import compositing
+
+
+@pytest.fixture
+def scene(kernels):
+    """Footprints, and where float32 cannot change a decision; the picture ends within tiles."""
+    return sample(12, (5, 9)) if kernels.interpreted else sample(300)
+
+
+@pytest.mark.parametrize("thresholds", THRESHOLDS)
+def test_an_ordinary_scene_is_torch_in_float64(kernels, thresholds):
+    options = dict(zip(("alpha_threshold", "transmittance_stop"), thresholds, strict=True))
+    size = (12, 13) if kernels.interpreted else (40, 56)
+    projected, certain = sample(kernels.few(300, 20), size, thresholds)
+    features = random(len(projected), 5)
+    got = outcome(projected, features, certain, kernels, **options)
+    assert_close(got, exact(projected, features, certain, **options), certain)
+
+
+@SELDOM_INTERPRETED
+@pytest.mark.parametrize("width", [0, 1, 4, 5, 8, 9, 11, 20])
+def test_any_number_of_features(kernels, scene, width):
+    projected, certain = scene
+    features = random(len(projected), width)
+    assert_close(outcome(projected, features, certain, kernels), exact(projected, features, certain), certain)
+
+
+@SELDOM_INTERPRETED
+@pytest.mark.parametrize("size", [(8, 8), (11, 5), (1, 1), (3, 100)])
+def test_image_sizes(kernels, size):
+    projected, certain = sample(kernels.few(60, 12), size)
+    got = outcome(projected, projected.colors, certain, kernels)
+    assert_close(got, exact(projected, projected.colors, certain), certain)
+
+
+def test_what_is_asked_for_beside_the_image_does_not_change_its_bits(kernels, scene):
+    projected = kernels.move(scene[0])
+    features = kernels.move(random(len(projected), 20))
+    first = composite(projected, features[:, :3], backend=kernels.backend)
+    for width in (3, 9) if kernels.interpreted else (3, 4, 6, 8, 9, 12, 20):
+        for median in (False, True):
+            out = composite(projected, features[:, :width], median_depth=median, backend=kernels.backend)
+            assert torch.equal(out.features[:, :3], first.features)
+            assert torch.equal(out.transmittance, first.transmittance)
+
+
+@SELDOM_INTERPRETED
+@pytest.mark.parametrize("width", [3, pytest.param(11, marks=pytest.mark.slow)])
+def test_row_slices_change_nothing(kernels, width):
+    few = kernels.interpreted
+    projected, certain = sample(10, (24, 9)) if few else sample(800, (80, 112))
+    features = random(len(projected), width)
+    whole = outcome(projected, features, certain, kernels)
+    for max_bytes in (2**13,) if few else (2**20, 2**18):
+        sliced = outcome(projected, features, certain, kernels, max_bytes=max_bytes)
+        assert all(torch.equal(a, b) for a, b in zip(sliced[0], whole[0], strict=True))
+        assert_close(sliced, whole, certain, 2e-6)
+    with pytest.raises(ValueError, match="^max_bytes:"):
+        outcome(projected, features, certain, kernels, max_bytes=500 if few else 3000)
+
+
+@SELDOM_INTERPRETED
+def test_several_cameras_in_row_slices(kernels):
+    gaussians = random_gaussians(10, 1, torch.float32, None, 16, (0.05, 1.0))
+    cameras = batch(*(random_camera(16, 11, seed, torch.float32) for seed in range(2)))
+    projected, options = project(gaussians, cameras), {"alpha_threshold": 0.0, "transmittance_stop": 0.0}
+    features = random(len(projected), 5)
+    got = outcome(projected, features, None, kernels, **options, max_bytes=2**13)
+    assert_close(got, exact(projected, features, **options))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kernels", [Target("triton")], indirect=True)
+def test_a_row_slice_is_freed_before_the_next_is_made(kernels, monkeypatch):
+    """In the backward pass too: `max_bytes` is for one of them."""
+    projected, certain = sample(10, (24, 9))
+    held, real = [], compositing.GpuCompositor._composite_rows
+
+    def composite_rows(self, *arguments):
+        assert not [1 for reference in held if reference() is not None]
+        lists = real(self, *arguments)
+        held[:] = [weakref.ref(x) for x in (lists.entries, lists.slots, lists.offsets, lists.starts)]
+        return lists
+
+    monkeypatch.setattr(compositing.GpuCompositor, "_composite_rows", composite_rows)
+    outcome(projected, random(len(projected), 3), certain, kernels, max_bytes=2**13)
+    assert held
+
+
+def test_no_gaussians_and_no_entries(kernels):
+    none, _ = sample(0, (9, 11))
+    unseen = footprints([0.0, 0.5], [[5.0, 4.0], [500.0, 4.0]], random(2, 2, 3), size=(9, 11))
+    for projected in (none, unseen):
+        (sums, transmittance, median), gradients = outcome(projected, random(len(projected), 3), None, kernels)
+        assert not sums.any()
+        assert not median.any()
+        assert (transmittance == 1).all()
+        assert not any(x.any() for x in gradients)
+
+
+@pytest.mark.parametrize("wanted", [(0, 0, 0, 1), (1, 1, 1, 0), (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0)])
+def test_only_what_is_wanted_is_differentiated(kernels, scene, wanted):
+    projected, certain = scene
+    features = random(len(projected), 3)
+    whole = outcome(projected, features, certain, kernels)[1]
+    some = outcome(projected, features, certain, kernels, wanted=tuple(map(bool, wanted)))[1]
+    expected = [x for x, needed in zip(whole, wanted, strict=True) if needed]
+    assert all(torch.equal(a, b) for a, b in zip(some, expected, strict=True))
+
+
+def test_inputs_of_any_layout_again_without_a_graph_and_in_inference_mode(kernels, scene):
+    projected = kernels.move(scene[0])
+    features = kernels.move(random(6, len(projected))).t()[:, ::2]
+    factors = projected.factors.permute(2, 1, 0).contiguous().permute(2, 1, 0)
+    found = []
+    for p, f in ((dataclasses.replace(projected, factors=factors), features), (projected, features.contiguous())):
+        p, inputs = leaves(p, f)
+        out = composite(p, inputs[-1], backend=kernels.backend)
+        loss = out.features.mean() + out.transmittance.sum()  # whose gradients are views
+        found += [torch.autograd.grad(loss, inputs, retain_graph=True) for _ in range(2)]
+        with pytest.raises(RuntimeError, match="expected backward without create_graph, there is no second derivative"):
+            torch.autograd.grad(loss, inputs, create_graph=True)
+        with torch.inference_mode():
+            assert torch.equal(composite(p, inputs[-1], backend=kernels.backend).features, out.features)
+    assert all(torch.equal(a, b) for other in found[1:] for a, b in zip(found[0], other, strict=True))
+
+
+# -- sums of absolute values -----------------------------------------------------------------------------------------
+
+
+def absolute(projected, target, dtype, features=3, **options):
+    """The centres of one render after its backward pass, on the CPU: their gradients and sums of absolute values."""
+    generator = torch.Generator().manual_seed(5)
+    rows = torch.rand(len(projected), features, generator=generator, dtype=torch.float64)
+    moved, (centres, *_, colors) = leaves(target.move(projected, dtype), target.move(rows, dtype))
+    options = RasterOptions(**{"absgrad": True} | options)
+    out = composite(moved, colors, options=options, backend=target.backend)
+    image = torch.cat([out.features, out.transmittance], 1)
+    (image * torch.randn(image.shape, generator=generator, dtype=torch.float64).to(image)).sum().backward()
+    return centres
+
+
+@pytest.mark.parametrize("options", [{}, {"max_bytes": 2**16}], ids=["whole", "slices"])
+def test_sums_of_absolute_values_are_those_of_torch(kernels, scene, options):
+    projected, _ = scene
+    expected = absolute(projected, TORCH, torch.float64).absgrad
+    found = absolute(projected, kernels, torch.float32, **options)
+    assert (found.absgrad.cpu() - expected).abs().max() <= 1e-5 * expected.max()
+    plain = absolute(projected, kernels, torch.float32, absgrad=False, **options)
+    assert torch.equal(found.grad, plain.grad)
+    assert not hasattr(plain, "absgrad")
+
+
+# -- stiff cases -----------------------------------------------------------------------------------------------------
+
+
+@SELDOM_INTERPRETED
+@pytest.mark.parametrize("opacity", [1e-30, 0.5, 0.99, 1.0, 2.0, 1e6, 1e38, torch.inf])
+@pytest.mark.parametrize("threshold", [0.0, TH])
+def test_opacities_from_nothing_to_everything(kernels, opacity, threshold):
+    layers = footprints([opacity, 0.5], [[5.2, 4.1], [7.0, 3.0]], 2 * random(2, 2, 3), size=(8, 11), eps2d=0.3)
+    features = random(2, 3)
+    got = outcome(layers, features, None, kernels, alpha_threshold=threshold)
+    expected = exact(layers, features, alpha_threshold=threshold)
+    assert_close(got, expected, None, 2e-5, 2e-6 + 1e-6 * max(0, math.log2(min(opacity, 1e38))))
+
+
+@SELDOM_INTERPRETED
+@pytest.mark.parametrize("length", [30.0, 1e4])
+@pytest.mark.parametrize("turn", [0.0, 0.6, math.pi / 2])
+def test_needles_and_footprints_wider_than_the_picture(kernels, length, turn):
+    c, s = math.cos(turn), math.sin(turn)
+    needle = [[c * length, -s * 0.2, 0.0], [s * length, c * 0.2, 0.0]]
+    factors = torch.tensor([needle, [[length, 0.0, 0.0], [0.0, length, 0.0]], needle])
+    layers = footprints([0.6, 0.3, 0.9], [[5.3, 4.2], [3.0, 3.0], [9.0, 7.0]], factors, size=(9, 12), eps2d=0.3)
+    options, features = {"alpha_threshold": 0.0, "transmittance_stop": 0.0}, random(3, 3)
+    got = outcome(layers, features, None, kernels, **options)
+    assert_close(got, exact(layers, features, **options), None, 5e-5, 1e-5)
+
+
+@SELDOM_INTERPRETED
+@pytest.mark.parametrize("field", ["means2d", "factors", "opacities"])
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf, 1e9, 1e12])
+def test_what_is_not_finite_or_overflows_is_as_in_torch(kernels, field, value):
+    layers = footprints([0.7, 0.5, 0.6], 9 * torch.rand(3, 2), 2 * random(3, 2, 3), size=(9, 11), eps2d=0.3)
+    getattr(layers, field)[1] = value if field != "factors" else value * torch.eye(2, 3)
+    features = random(3, 3)
+    # an exponent of a huge opacity is rounded; all else must overflow as it does in float32
+    expected = exact(layers, features) if field == "opacities" else outcome(layers, features)
+    got = outcome(layers, features, None, kernels)
+    assert all(x.isfinite().all() for x in expected[0])
+    assert_close((got[0], ()), (expected[0], ()), image_bound=5e-5)
+    for a, b in zip(got[1], expected[1], strict=True):
+        if b.isfinite().all():
+            assert torch.allclose(a.double(), b.double(), atol=1e-5)
+
+
+@SELDOM_INTERPRETED
+def test_long_lists_end_where_the_light_does(kernels):
+    layers = footprints([0.8] * 60, size=(5, 3))  # the light ends after six of them
+    features = random(60, 3)
+    assert_close(outcome(layers, features, None, kernels), exact(layers, features))

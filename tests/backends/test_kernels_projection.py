@@ -1,0 +1,322 @@
+"""The projection of kernels against that of torch: the same list, values and gradients within float32."""
+
+import importlib
+import math
+
+import numpy as np
+import pytest
+import torch
+from factories import (
+    FIELDS,
+    LENS_PARAMS,
+    leaves,
+    pinhole,
+    posed,
+    random_camera,
+    random_gaussians,
+    replace,
+    select,
+    with_camera,
+)
+from kornia.sensors.camera import CameraModelType
+from projection_checks import DIFFERENTIABLE, assert_alike, list_and_gradients, wide_scene
+from targets import COMPILED, SELDOM_INTERPRETED, TORCH
+
+import kgs
+from kgs import GaussianRenderer, Gaussians, RasterOptions, composite, project
+from kgs.backends import BACKENDS
+from kgs.harmonics import SH_C0
+
+
+@pytest.fixture
+def handed_over(kernels, monkeypatch):
+    """How often the projection of the backend asks that of torch."""
+    calls = []
+    package = next(type(backend).__module__ for backend in BACKENDS if backend.name == kernels.backend)
+    module = importlib.import_module(f"{package}.projection")
+    real = module.project_in_torch
+    monkeypatch.setattr(module, "project_in_torch", lambda *a: calls.append(1) or real(*a))
+    return calls
+
+
+@pytest.mark.parametrize(("degree", "cameras"), [(None, 1), (0, 1), (1, 2), (2, 1), (3, 3)])
+def test_harmonics_of_every_degree_and_features(kernels, degree, cameras, handed_over):
+    n = kernels.few(400, 120)
+    got, _ = assert_alike(*wide_scene(degree, n, cameras), kernels)
+    assert n / 4 < len(got) < 3 * n / 4 * cameras
+    assert not handed_over
+
+
+@SELDOM_INTERPRETED
+def test_features_of_any_width_no_colors_at_all_and_opacities_of_each_camera(kernels):
+    gaussians, cameras = wide_scene(None, 100, cameras=2)
+    for width in (0, 1, 7, 17):
+        assert_alike(replace(gaussians, colors=torch.rand(100, width)), cameras, kernels)
+    for degree in (None, 3):
+        got, grads = assert_alike(*wide_scene(degree, 60), kernels, colors=False)
+        assert got.colors.shape == (len(got), 0)
+        assert grads["colors"] is None
+    assert_alike(replace(gaussians, opacities=torch.rand(2, 100)), cameras, kernels)
+
+
+@SELDOM_INTERPRETED
+@pytest.mark.parametrize("largest", [0.0, 1.9, 2.1, 50.0])
+@pytest.mark.parametrize("threshold", [1 / 255, 0.3, 0.0])
+def test_large_opacities_widen_what_is_seen_unless_they_belong_to_one_that_is_not_finite(kernels, largest, threshold):
+    gaussians, cameras = wide_scene(1, 100)
+    opacities, means = gaussians.opacities.clone(), gaussians.means.clone()
+    opacities[3] = largest
+    strong = replace(gaussians, opacities=opacities)
+    assert_alike(strong, cameras, kernels, alpha_threshold=threshold)
+    means[3, 0] = torch.inf
+    assert_alike(replace(strong, means=means), cameras, kernels, alpha_threshold=threshold)
+
+
+@SELDOM_INTERPRETED
+@pytest.mark.parametrize("block", [[[50.0, 4.0], [0.0, 60.0]], [[-50.0, 0.0], [0.0, 60.0]], [[50.0, 4.0], [-3, -60.0]]])
+def test_cameras_with_skew_negative_focal_lengths_and_an_anisotropic_block(kernels, block, handed_over):
+    gaussians, cameras = wide_scene(n=100)
+    k = cameras.intrinsics[0].clone()
+    k[:2, :2] = torch.tensor(block)
+    assert_alike(gaussians, with_camera(cameras, intrinsics=k), kernels)
+    assert not handed_over
+
+
+@SELDOM_INTERPRETED
+@pytest.mark.parametrize(
+    "change",
+    [torch.eye(3) * 1.7, torch.tensor([[1.0, 0.2, 0.0], [0.0, 0.9, -0.1], [0.1, 0.0, 1.2]])],
+    ids=["scaled", "sheared"],
+)
+def test_poses_that_are_scaled_or_sheared(kernels, change, handed_over):
+    gaussians, cameras = wide_scene(3, kernels.few(400, 30))
+    pose = cameras.extrinsics[0].clone()
+    pose[:3, :3] = change @ pose[:3, :3]
+    for wanted in (FIELDS, ("extrinsics", "intrinsics")):
+        assert_alike(gaussians, with_camera(cameras, extrinsics=pose), kernels, wanted)
+    assert not handed_over
+
+
+@pytest.mark.parametrize("degree", [None, 3])
+@pytest.mark.parametrize(
+    "wanted",
+    [
+        ("extrinsics",),
+        ("extrinsics", "intrinsics", *FIELDS),
+        *(pytest.param(x, marks=pytest.mark.slow) for x in (("intrinsics",), ("extrinsics", "intrinsics"))),
+    ],
+)
+def test_gradients_of_cameras(kernels, degree, wanted, handed_over):
+    gaussians, cameras = wide_scene(degree, kernels.few(400, 30), cameras=2)
+    lens = cameras.intrinsics + torch.tensor([[0.0, 3.0], [-2.0, 0.0]]).repeat(2, 2) * torch.eye(4)[:, [1, 0, 2, 3]]
+    assert_alike(gaussians, with_camera(cameras, intrinsics=lens), kernels, wanted)
+    assert not handed_over
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"near_plane": 4.0}, {"eps2d": 0.0}, {"eps2d": 2.5, "near_plane": 1e-6}, {"frame": (10.0, 8.0, 40.0, 30.0)}],
+)
+def test_options(kernels, options):
+    assert_alike(*wide_scene(1, 100), kernels, **options)
+
+
+def test_the_limits_of_the_tangents_belong_to_what_has_a_gradient(kernels):
+    # x / z, y / z at, within and beyond the limits (8.5 + 2.4) / 8 and (4.5 + 1.2) / 8, both exact in binary
+    camera = pinhole(8, 16, 8.0, (8.0, 4.0), dtype=torch.float32)
+    limits = kgs.camera.tangent_limits(
+        torch.tensor([8.0, 8.0]), torch.tensor([8.0, 4.0]), kgs.camera.whole_frame((8, 16))
+    )
+    x = torch.stack([limits[0, 0], limits[0, 1], limits[0, 1] * 1.5, limits[0, 0] * 0.5])
+    y = torch.stack([limits[1, 1], limits[1, 0] * 2, limits[1, 0], limits[1, 1] * 0.5])
+    base = random_gaussians(4, 0, torch.float32, 1)
+    gaussians = replace(base, means=torch.stack([x, y, torch.ones(4)], 1), scales=torch.full((4, 3), 0.5))
+    got, grads, _ = list_and_gradients(gaussians, camera, kernels, alpha_threshold=0.0)
+    expected = list_and_gradients(gaussians, camera, alpha_threshold=0.0)[1]
+    assert got.gaussian_ids.tolist() == [0, 1, 2, 3]
+    assert torch.allclose(grads["means"], expected["means"], rtol=1e-5, atol=1e-5)
+
+
+@SELDOM_INTERPRETED
+@pytest.mark.parametrize("wanted", FIELDS)
+def test_only_what_is_asked_for_has_a_gradient(kernels, wanted):
+    assert_alike(*wide_scene(1, 60), kernels, (wanted,), accuracy=1e-5)
+
+
+def test_a_second_backward_needs_the_graph_and_a_second_derivative_is_refused(kernels):
+    gaussians, cameras = (kernels.move(x) for x in wide_scene(n=60))
+    with torch.inference_mode():
+        assert not project(gaussians, cameras, backend=kernels.backend).means2d.requires_grad
+    moved, inputs = leaves(gaussians)
+    loss = project(moved, cameras, backend=kernels.backend).factors.square().sum()
+    first = torch.autograd.grad(loss, inputs[:3], retain_graph=True)
+    with pytest.raises(RuntimeError, match="expected backward without create_graph"):
+        torch.autograd.grad(loss, inputs[:3], create_graph=True)
+    second = torch.autograd.grad(loss, inputs[:3])
+    assert all(torch.equal(x, y) for x, y in zip(first, second, strict=True))
+    with pytest.raises(RuntimeError, match="second time"):
+        torch.autograd.grad(loss, inputs[:3])
+
+
+def test_what_the_kernels_cannot_project_goes_to_torch(kernels, handed_over):
+    gaussians, cameras = (kernels.move(x) for x in wide_scene(n=60))
+    flat = cameras.extrinsics.clone()
+    flat[0, 2, :3] = 0.0
+    with pytest.raises(ValueError, match="^extrinsics:"):
+        project(gaussians, with_camera(cameras, extrinsics=flat), backend=kernels.backend)
+    project(gaussians, cameras, options=RasterOptions(near_plane=0.0), backend=kernels.backend)
+    params = kernels.move(torch.tensor(LENS_PARAMS[CameraModelType.PINHOLE]))
+    lens = posed(CameraModelType.PINHOLE, params, extrinsics=cameras.extrinsics)
+    got, expected = (project(gaussians, lens, backend=name) for name in (kernels.backend, "torch"))
+    assert torch.equal(got.means2d, expected.means2d)
+    assert len(handed_over) == 3
+
+
+def test_float64_is_refused_by_name_and_left_to_torch_by_auto(kernels):
+    gaussians, cameras = kernels.move(random_gaussians(30, 0)), kernels.move(random_camera(8, 8, 0))
+    assert project(gaussians, cameras).means2d.dtype == torch.float64
+    with pytest.raises(ValueError, match=f"backend: {kernels.backend!r} does not cover this call of projection"):
+        project(gaussians, cameras, backend=kernels.backend)
+
+
+@SELDOM_INTERPRETED
+def test_a_camera_that_is_changed_before_the_backward_pass_does_not_change_it(kernels):
+    gaussians, cameras = (kernels.move(x) for x in wide_scene(n=kernels.few(400, 20)))
+    found = []
+    for shift in (0.0, 0.5):
+        means = gaussians.means.clone().requires_grad_()
+        image = GaussianRenderer(backend=kernels.backend)(replace(gaussians, means=means), cameras).image
+        cameras.extrinsics[0, 0, 3] += shift
+        image.square().sum().backward()
+        found.append(means.grad)
+    assert torch.equal(*found)
+
+
+@pytest.mark.parametrize("degree", [None, 0, 3])
+def test_nothing_to_see(kernels, degree):
+    gaussians, cameras = wide_scene(degree, 30, cameras=2)
+    for none in (gaussians[:0], replace(gaussians, means=-gaussians.means.abs() - 100)):
+        got, grads = assert_alike(none, cameras, kernels)
+        assert len(got) == 0
+        assert all(grads[name] is not None and not grads[name].any() for name in FIELDS)
+
+
+# -- numbers that are extreme ----------------------------------------------------------------------------------------
+
+
+@SELDOM_INTERPRETED
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
+def test_what_is_not_finite_is_counted_once_and_left_out(kernels, bad):
+    n = kernels.few(400, 60)
+    gaussians, cameras = wide_scene(3, n, cameras=2)
+    gaussians = replace(gaussians, opacities=gaussians.opacities.repeat(2, 1))
+    for i, name in enumerate(FIELDS):
+        values = getattr(gaussians, name)
+        values[(1, 10 + i) if name == "opacities" else 10 + i].view(-1)[-1] = bad
+    gaussians.colors[20, 1], gaussians.colors[20, 2] = torch.inf, -torch.inf
+    gaussians.colors[21] = 3e37  # finite, the sum is not
+    got, grads, _ = list_and_gradients(gaussians, cameras, kernels)
+    listed = list_and_gradients(gaussians, cameras)[0]
+    assert got.num_nonfinite.item() == listed.num_nonfinite.item() == 6
+    assert torch.equal(got.gaussian_ids, listed.gaussian_ids)
+    spoilt = torch.tensor([10, 11, 12, 13, 14, 20])
+    kept = torch.tensor([i for i in range(n) if i not in (*spoilt.tolist(), 21)])
+    expected = list_and_gradients(select(gaussians, kept), cameras)[1]
+    for name in FIELDS:
+        rows, same = (x[name].T if name == "opacities" else x[name] for x in (grads, expected))
+        assert (rows[spoilt] == 0).all()
+        torch.testing.assert_close(rows[kept], same, rtol=1e-4, atol=1e-5 * float(same.abs().max()))
+
+
+@SELDOM_INTERPRETED
+@pytest.mark.parametrize("power", [-44.0, 20.0, 44.0, 60.0, 88.0])
+@pytest.mark.parametrize("axes", [1, 3])
+def test_footprints_that_overflow_are_left_out_with_gradient_zero(kernels, power, axes):
+    gaussians, cameras = wide_scene(n=100)
+    gaussians.scales[:50, :axes] = np.exp(power)
+    got, grads, _ = list_and_gradients(gaussians, cameras, kernels)
+    listed = list_and_gradients(gaussians, cameras)[0]
+    assert torch.equal(got.gaussian_ids, listed.gaussian_ids)
+    left_out = ~torch.isin(torch.arange(100), got.gaussian_ids)
+    for name in FIELDS:
+        assert (grads[name][left_out] == 0).all()
+        assert grads[name].isfinite().all()
+
+
+@pytest.mark.parametrize("norm", [0.0, 1e-40, 1e-30, 1e30])
+def test_quaternions_of_any_norm(kernels, norm):
+    gaussians, cameras = wide_scene(n=30)
+    gaussians = replace(gaussians, quats=torch.nn.functional.normalize(gaussians.quats) * norm)
+    got, grads, _ = list_and_gradients(gaussians, cameras, kernels)
+    listed, expected, _ = list_and_gradients(gaussians, cameras)
+    assert torch.allclose(got.factors, listed.factors, rtol=1e-5, atol=1e-4 * float(listed.factors.abs().max()))
+    if norm == 0.0:
+        assert not grads["quats"].any()
+    elif norm != 1e-40:  # whose gradients overflow
+        assert (grads["quats"] - expected["quats"]).abs().max() <= 1e-5 * expected["quats"].abs().max()
+
+
+def test_needles_from_far_and_near_and_flat_gaussians(kernels):
+    gaussians, cameras = wide_scene(n=120)
+    scales = gaussians.scales * torch.tensor([1e3, 1e-3, 1.0])
+    assert_alike(replace(gaussians, scales=scales), cameras, kernels)
+    scales = gaussians.scales.clone()
+    scales[::2, 1] = 0.0
+    assert_alike(replace(gaussians, scales=scales), cameras, kernels)
+
+
+@SELDOM_INTERPRETED
+def test_a_color_of_exactly_zero_passes_the_gradient_and_one_below_does_not(kernels):
+    gaussians, cameras = wide_scene(0, n=40)
+    near = np.float32(-0.5 / SH_C0)
+    around = (near, np.nextafter(near, np.float32(0)), np.nextafter(near, near - np.float32(1)))
+    zeros = [x for x in around if np.float32(SH_C0) * x == -0.5]
+    assert zeros
+    colors = torch.tensor(zeros).repeat(40)[:40, None, None].repeat(1, 1, 3)
+    colors[:, :, 1], colors[:, :, 2] = -3.0, 3.0
+    got, grads, _ = list_and_gradients(replace(gaussians, colors=colors), cameras, kernels)
+    expected = list_and_gradients(replace(gaussians, colors=colors), cameras)[1]
+    assert got.colors[:, 1].eq(0).all()
+    assert torch.allclose(grads["colors"], expected["colors"], rtol=1e-6)
+    assert grads["colors"][got.gaussian_ids, 0, 0].ne(0).all()
+
+
+@SELDOM_INTERPRETED
+def test_tensors_with_the_negative_bit(kernels):
+    """What `conj().imag` gives: a view whose numbers stand in memory with the other sign."""
+    gaussians, cameras = (kernels.move(x) for x in wide_scene(1, n=60))
+    lazy = {name: torch.complex(torch.zeros_like(x), -x).conj().imag for name, x in vars(gaussians).items()}
+    assert all(x.is_neg() for x in lazy.values())
+    found = []
+    for given in (Gaussians(**lazy), gaussians):
+        projected = project(given, cameras, backend=kernels.backend)
+        features = composite(projected, projected.colors, backend=kernels.backend).features
+        found.append([*(getattr(projected, name) for name in DIFFERENTIABLE), features])
+    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
+
+
+@COMPILED
+@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize("value", [0.0, 1e-45, 1e-30, 1e10, 1.8e19, 1e20, 1e30])
+def test_extreme_values_spoil_no_other_gaussian(kernels, field, value):
+    """Some Gaussians are far, huge or tiny in one field: images and gradients of all others are those of torch."""
+    degree = 3 if field in ("means", "colors") else 0
+    gaussians, cameras = wide_scene(degree, 400, cameras=2)
+    some = getattr(gaussians, field)[5:15]
+    some.copy_(some * value if field in ("means", "scales") else torch.full_like(some, value))
+    image, grads = image_and_gradients(gaussians, cameras, kernels)
+    expected, same = image_and_gradients(gaussians, cameras, TORCH)
+    rounding = 1e-5 + 1e-6 * max(0.0, math.log2(value or 1.0)) * (field == "opacities")  # of the exponent
+    torch.testing.assert_close(image, expected, rtol=1e-4, atol=rounding * float(expected.abs().max()))
+    for name in FIELDS:
+        got, wanted = (torch.cat([x[name][:5], x[name][15:]]) for x in (grads, same))
+        assert got.isfinite().all()
+        torch.testing.assert_close(got, wanted, rtol=1e-3, atol=1e-5 * float(wanted.abs().max()))
+
+
+def image_and_gradients(gaussians, cameras, target):
+    inputs = {name: target.move(getattr(gaussians, name)).clone().requires_grad_() for name in FIELDS}
+    image = GaussianRenderer(backend=target.backend)(Gaussians(**inputs), target.move(cameras)).image
+    weights = torch.randn(image.shape, generator=torch.Generator().manual_seed(0))
+    (image * target.move(weights)).sum().backward()
+    return image.detach().cpu(), {name: value.grad.cpu() for name, value in inputs.items()}
