@@ -6,15 +6,10 @@ The method: `drop` (the layer), `renderer`, `model`, `types`, `camera`, `project
 `gsplat` has gsplat's interface; `app` is the command.
 """
 
-import os
-import sys
-
-if "torch" not in sys.modules and "GOMP_SPINCOUNT" not in os.environ:
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read when torch is loaded: threads that wait yield their core
-
 from ._support.errors import DataError, TrainingDiverged
 from ._support.lazy import TYPE_CHECKING, lazy_names
 from ._support.version import __version__ as __version__
+from ._support.wait_policy import wait_passively
 
 if TYPE_CHECKING:
     from .camera import PosedCamera, pinhole_cameras
@@ -33,7 +28,7 @@ __all__ = ["DropGaussian", "drop_gaussian", "GaussianRenderer", "rasterization",
 __all__ += ["Gaussians", "ProjectedGaussians", "RasterOptions", "Rendering", "PosedCamera", "pinhole_cameras"]
 __all__ += ["GaussianModel", "Densifier", "DensifyReport", "camera_extent", "save_ply", "load_ply"]
 __all__ += ["save_compressed_ply"]
-__all__ += ["DataError", "TrainingDiverged"]
+__all__ += ["DataError", "TrainingDiverged", "wait_passively"]
 
 # so that the command `kgs` can answer before torch is loaded
 __getattr__, __dir__ = lazy_names(

@@ -11,7 +11,8 @@ from typing import Any, TextIO
 
 from kgs._support.errors import printable
 
-_FIRST_LINE = 2.0  # seconds
+_FIRST_LINE = 10.0  # seconds after which a stage has a line, where there is no terminal
+_NEXT_LINE = 30.0  # seconds between two lines
 VIEWER = "open {} in a viewer of 3DGS files, for example superspl.at/editor in a browser"  # a step to suggest
 
 
@@ -58,10 +59,10 @@ def _escaped(letter: str) -> str:
 
 @contextmanager
 def progress(total: int, title: str, done: int = 0, unit: str = "step") -> Iterator[Callable[..., None]]:
-    """Show the progress of a stage of `total` units on stderr: a bar on a terminal, else a line for every tenth.
+    """Show the progress of a stage of `total` units on stderr: a bar on a terminal, else a line every half minute.
 
-    Both have the time that is left. The first line comes with the first unit that ends after two seconds, at a tenth of
-    the total at the latest.
+    Both have the time that is left. Off a terminal, in a file or a pipe, the first line comes after ten seconds, and a
+    short stage has none.
 
     Args:
         total: number of units; with 0 nothing is shown.
@@ -80,10 +81,10 @@ def progress(total: int, title: str, done: int = 0, unit: str = "step") -> Itera
             bar = tqdm(total=total, initial=done, desc=title, unit=unit, mininterval=0.5, file=sys.stderr)
     before = done
     begin = time.monotonic()
-    is_first = True
+    due = _FIRST_LINE
 
     def advance(note: str = "") -> None:
-        nonlocal done, is_first
+        nonlocal done, due
         done += 1
         if bar is not None:
             with suppress(OSError, ValueError):
@@ -91,9 +92,8 @@ def progress(total: int, title: str, done: int = 0, unit: str = "step") -> Itera
                 bar.update()
             return
         seconds = time.monotonic() - begin
-        is_early = is_first and seconds > _FIRST_LINE
-        if is_early or done * 10 // total > (done - 1) * 10 // total:
-            is_first = False
+        if seconds >= due:
+            due = seconds + _NEXT_LINE
             left = seconds / (done - before) * (total - done)
             parts = [f"{title}: {done} of {total} {unit}s"]
             if left > 1:

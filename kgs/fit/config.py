@@ -59,14 +59,14 @@ class Recipe:
         densify_from: no densification up to this step.
         densify_interval: steps between two densifications.
         grad_threshold: least mean gradient, in normalised device coordinates, of a Gaussian that is densified.
-        absgrad: take gradients of each pixel by their absolute values (AbsGS), which are about four times as large.
+        absgrad: whether gradients of each pixel count by their absolute values (AbsGS), about four times as large.
         percent_dense: largest scale, as a fraction of the extent, of a Gaussian that is cloned; larger ones are split.
         prune_opacity: Gaussians below this opacity are removed.
         opacity_decay: factor on all opacities after each step, in (0, 1]; it does not depend on the number of steps.
             None: 0.9925 for up to three training views and 1000 steps, else 0.995.
         decay_from: share of the steps after which this decay begins, in [0, 1].
-        haze_interval: steps between two looks for Gaussians that veil a training view, whose opacities are halved, see
-            :mod:`kgs.fit.haze`; at least 50, and none in the last tenth of the steps. 0: none at all.
+        haze_interval: steps between two looks for Gaussians that veil a training view, whose opacities are halved; at
+            least 50, and none in the last tenth of the steps. 0: none at all.
         reset_interval: steps between two resets of all opacities; 0: none.
         reset_opacity: a reset lowers larger opacities to this; with resets more than `prune_opacity`.
         reset_recovery: a reset is skipped if fewer steps than this follow before the next one or the end.
@@ -149,7 +149,7 @@ class FitConfig:
             of the background's colour. scene: the background of the scene, as in test views.
         max_gaussians: largest number of Gaussians, at which densification stops. Unless given: 10 per step, and at
             least 1.5 times the number of initial points.
-        prune: remove Gaussians that no training view shows, and harmonics that change no image.
+        prune: whether Gaussians that no training view shows are removed, and harmonics that change no image.
         max_bytes: bound on the working memory of a render, in bytes; it changes results only by rounding.
         evaluations: how often the PSNR curve is measured, the last time at the end.
         device: cpu, cuda, cuda:1, ...

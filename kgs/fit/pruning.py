@@ -99,9 +99,9 @@ def left_out(decisions: Decisions) -> str:
         parts.append(f"harmonics ({why or 'by rule'})")
     overlap = decisions.overlap
     if overlap is not None and overlap.drop == 0:
-        parts.append(f"dropping (two patches of surface are shown together by {overlap.views_per_pair:.1f} photos)")
+        parts.append(f"dropping (on average {overlap.views_per_pair:.1f} photos show two patches of surface together)")
     gaussians = decisions.gaussians
-    if gaussians is not None and gaussians.kept < gaussians.fitted:
-        share = 1 - gaussians.kept / gaussians.fitted
-        parts.append(f"{100 * share:.0f} % of the Gaussians (next to no contribution to a training view)")
+    share = 0.0 if gaussians is None else 1 - gaussians.kept / max(gaussians.fitted, 1)
+    if share >= 0.005:
+        parts.append(f"{100 * share:.0f} % of the Gaussians, which no training photo needs")
     return ", ".join(parts)

@@ -15,23 +15,29 @@ class Terminal(io.StringIO):
         return True
 
 
-@pytest.mark.parametrize(("total", "done", "told"), [(200, 50, range(60, 201, 20)), (3, 0, (1, 2, 3))])
-def test_without_a_terminal_a_line_every_tenth(capsys, total, done, told):
-    with progress(total, "depth maps", done=done, unit="view") as advance:
-        for _ in range(total - done):
-            advance("fine")
-    lines = capsys.readouterr().err.splitlines()
-    assert lines == [f"depth maps: {count} of {total} views, fine" for count in told]
+LEFT = {1: ", 1.8 minutes left", 4: ", 72 s left", 7: ", 36 s left", 10: ""}
 
 
 @pytest.mark.parametrize(
     ("total", "done", "seconds", "told"),
     [
-        (1000, 500, [0.9] * 3, ["503 of 1000 steps, 7.5 minutes left"]),  # 0.9 s for each of 497
-        (10, 0, [3.0] * 10, [*(f"{i} of 10 steps, {30 - 3 * i} s left" for i in range(1, 10)), "10 of 10 steps"]),
+        (200, 50, [0.05] * 150, []),  # less than ten seconds
+        (1000, 500, [1.0] * 60, ["510 of 1000 steps, 8.2 minutes left", "540 of 1000 steps, 7.7 minutes left"]),
+        (
+            10,
+            0,
+            [12.0] * 10,
+            [
+                "1 of 10 steps, 1.8 minutes left",
+                *(f"{i} of 10 steps, {120 - 12 * i} s left" for i in (4, 7)),
+                "10 of 10 steps",
+            ],
+        ),
     ],
 )
-def test_lines_tell_the_time_that_is_left_from_the_second_second_on(capsys, monkeypatch, total, done, seconds, told):
+def test_without_a_terminal_a_line_every_half_minute_with_the_time_that_is_left(
+    capsys, monkeypatch, total, done, seconds, told
+):
     now = 100.0
     monkeypatch.setattr("kgs.app.console.time.monotonic", lambda: now)
     with progress(total, "fit", done=done) as advance:

@@ -10,6 +10,8 @@ import sys
 import warnings
 from contextlib import suppress
 
+from kgs._support.wait_policy import wait_passively
+
 from .interrupts import leave_at_once
 
 
@@ -24,6 +26,7 @@ def main(arguments: list[str] | None = None) -> None:
             signal that ended the work.
     """
     leave_at_once()
+    wait_passively()
     from .run import exit_code
 
     _open_streams()

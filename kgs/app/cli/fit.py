@@ -200,8 +200,6 @@ def fit(
     posed = out if unposed else scene
     splat = published.folder / "splat.ply"
     renders = out / "renders"
-    shrink = request.shrink(source, loaded)
-    shrunk = ("--downscale", f"{shrink:g}") if shrink > 1.0 else ()
     say(f"{printable(splat)}: {metrics['gaussians']} Gaussians after {metrics['steps']} steps")
     if needless := left_out(published.fit.decisions):
         say(f"left out: {needless}")
@@ -215,8 +213,7 @@ def fit(
     say_next(
         f"open {as_line(out / 'index.html')} in a browser: the splat to look around in, and how good it is",
         *([more] if full_side else []),
-        f"{as_line('kgs', 'render', splat, '--cameras', posed, '-o', renders, *shrunk)}  # pictures from every camera",
-        f"{as_line('kgs', 'eval', out, '--lpips-weights', 'WEIGHTS')}  # measure again, with LPIPS",
+        f"{as_line('kgs', 'render', splat, '--cameras', posed, '-o', renders)}  # pictures from every camera",
         VIEWER.format(as_line(splat)),
     )
     return 0

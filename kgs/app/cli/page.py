@@ -42,8 +42,8 @@ def page(
         out: the HTML file to write.
         downscale: reduce the photos by this factor.
         background: the colour behind the splat, and behind photos with transparency.
-        photos: show photos beside their renders. --no-photos leaves them out: the page is smaller, and can go where the
-            photos must not.
+        photos: --no-photos leaves out the photos beside their renders: the page is smaller, and can go where the photos
+            must not.
         roll: turn all pictures clockwise by this angle in degrees, where photos lie on their side.
         device: cpu, cuda, ...
         backend: auto: the fastest that is installed. kgs fit --help-all describes the others.

@@ -49,7 +49,7 @@ _USER_ERRORS = {
     errno.EROFS,
 }
 _HELP_ALL = {"--help-all", "--help_all"}
-_HELP = {"-h", "--help"}
+_HELP = {"-h", "--help", "help"}
 
 
 def exit_code(words: list[str]) -> int:
@@ -102,7 +102,7 @@ def exit_code(words: list[str]) -> int:
 
 def _find(words: list[str]) -> tuple[str, list[str]]:
     """Split the words of a command line into the name of the command and the rest."""
-    if words[:1] == ["--version"]:
+    if words[:1] in (["--version"], ["-V"]):
         _say_versions()
         raise SystemExit(0)
     prefix = "bench " if words[:1] == ["bench"] else ""

@@ -53,7 +53,8 @@ def facts(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
 def verdict(runs: Runs) -> str:
     """How good the fit is in one or two sentences: by the PSNR of the held-out views, else by that of training views.
 
-    What a PSNR means in words is that of the last run with one; see docs/page.md for the limits of such words.
+    What a PSNR means in words is that of the last run with one, of photos that it was not trained on; see docs/page.md
+    for the limits of such words.
     """
     part = next((part for part in PARTS if any(metrics.get(part) for metrics in runs.values())), None)
     if part is None:
@@ -70,7 +71,8 @@ def verdict(runs: Runs) -> str:
     text = f"PSNR on {which}: not measured."
     if levels:
         numbers = ", ".join(with_run(f"{level:.1f} dB", run).replace(", ", " ") for run, level in levels.items())
-        text = f"PSNR on {which}: {numbers}, that is {_in_words(list(levels.values())[-1])}."
+        words = "" if part == "train" else f", that is {_in_words(list(levels.values())[-1])}"
+        text = f"PSNR on {which}: {numbers}{words}."
     if part != "train":
         return text
     unknown = "No photo was held out, so how good new views are was not measured"
