@@ -46,13 +46,13 @@ def test_many_tiles_keep_their_numbers(size, views, exactly):
         means=means,
         quats=torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64).repeat(41, 1),
         scales=torch.full((41, 3), 1e-9, dtype=torch.float64),
-        opacities=torch.full((41,), 0.5, dtype=torch.float64),
+        opacities=torch.linspace(0.3, 0.5, views, dtype=torch.float64)[:, None].expand(views, 41),
         colors=torch.rand(41, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) + 0.1,
     )
     lens = pinhole(height, width, (2000.0, 2000.0), dtype=dtype)
     image = GaussianRenderer()(dots.to(dtype), batch(*[lens] * views)).image
     lit = image[:, :, (height - 1) // 2 : height // 2 + 1].sum(2)  # the two middle rows share each dot
-    scale = 2 * 0.5 * math.exp(-0.5 * 0.25 / 0.3)
+    scale = 2 * dots.opacities[:, :1, None] * math.exp(-0.5 * 0.25 / 0.3)
     assert (lit[:, :, columns.long()] - scale * dots.colors.T).abs().max() <= 1e-6
     dark = torch.ones(width, dtype=torch.bool)
     for shift in (-3, -2, -1, 0, 1, 2, 3):
