@@ -127,7 +127,7 @@ def test_select_takes_rows_and_bands():
                 "sh_degree": {"chosen": 0, "by": "photos", "gain": 0.02, "n": 2000},
                 "gaussians": {"fitted": 200, "kept": 114, "weight": 1.0, "sh_degree": 0},
             },
-            "harmonics (they can gain +0.02 dB), 43 % of the Gaussians (next to no contribution to a training view)",
+            "harmonics (they can gain +0.02 dB), 43 % of the Gaussians, which no training photo needs",
         ),
     ],
 )
