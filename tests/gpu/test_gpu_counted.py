@@ -29,7 +29,7 @@ def test_the_counts_are_those_of_compositing_and_spare_it_a_wait(monkeypatch):
     fresh = composite(replace(found, means2d=found.means2d.clone()), found.colors, backend="triton").features
     assert waits == [known.entries]
     assert torch.equal(image, fresh)
-    sliced = RasterOptions(max_bytes=2**16)
+    sliced = RasterOptions(max_bytes=2**14)
     assert torch.equal(composite(found, found.colors, options=sliced, backend="triton").features, image)
     assert len(waits) > 2
 

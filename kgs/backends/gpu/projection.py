@@ -214,7 +214,7 @@ class _Projection(torch.autograd.Function):
         incoming = _incoming(gradients, means, ctx.harmonics)
         among = blocks(n, _BLOCK)
         totals = means.new_empty(among, 21) if with_camera else means  # to which nothing is written
-        poses, intrinsics = means.new_zeros(2, count, 4, 4) if with_camera else (None, None)
+        matrices = means.new_zeros(2, count, 4, 4) if with_camera else None  # poses and intrinsics
         found = (visible.cameras, visible.flags, visible.counts, n, among, opacities.numel() // n)
         for c in range(count):
             launch(
@@ -228,12 +228,12 @@ class _Projection(torch.autograd.Function):
                 ADD=c > 0,
                 BLOCK=_BLOCK,
             )
-            if poses is not None:
+            if matrices is not None:
                 total = wide_sum(totals, 0).float()
-                poses[c, :3] = total[:12].view(3, 4)
-                intrinsics[c, :3, :3] = total[12:].view(3, 3)
-        input_grads += [poses, intrinsics]
-        return *(x if need else None for x, need in zip(input_grads, needs, strict=True)), None, None
+                matrices[0, c, :3] = total[:12].view(3, 4)
+                matrices[1, c, :3, :3] = total[12:].view(3, 3)
+        found_grads = [*input_grads, *((None, None) if matrices is None else matrices)]
+        return *(x if need else None for x, need in zip(found_grads, needs, strict=True)), None, None
 
 
 def _incoming(gradients: tuple[Tensor | None, ...], like: Tensor, harmonics: bool) -> list[Tensor]:
