@@ -109,8 +109,8 @@ class Driver:
         """Nothing was loaded."""
 
 
-def measure(steps: int) -> None:
-    """Print the medians of a step, and of one without `launch`, as JSON."""
+def measure(steps: int, numbers: list[Any]) -> None:
+    """Print the medians of a step that reads some numbers, and of one without `launch`, as JSON."""
     from importlib import import_module
 
     import triton
@@ -118,10 +118,6 @@ def measure(steps: int) -> None:
     from kgs import stages
     from kgs.backends import gpu
 
-    environment = os.environ | {"TRITON_INTERPRET": "1"}
-    done = subprocess.run([sys.executable, __file__, "--record"], env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    numbers = json.loads(done.stdout.splitlines()[-1])
     gpu.GpuBackend.runs_on = lambda self, device: True
     stages._check_projected = lambda projected, features: None  # it looks at the numbers of a CPU's tensors
     step = cases().train
@@ -156,6 +152,13 @@ def measure(steps: int) -> None:
     print(json.dumps([whole, timed(steps)]))
 
 
+def output_of(command: list[str], environment: dict[str, str], given: str = "") -> Any:
+    """The JSON in the last line that a program prints."""
+    done = subprocess.run(command, env=environment, input=given, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
 def main() -> None:
     """Measure two installations in turn."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -169,14 +172,14 @@ def main() -> None:
     if arguments.record:
         return record()
     if arguments.measure:
-        return measure(arguments.steps)
+        return measure(arguments.steps, json.loads(sys.stdin.read()))
+    interpreted = os.environ | {"TRITON_INTERPRET": "1"}
+    numbers = [json.dumps(output_of([program, __file__, "--record"], interpreted)) for program in arguments.programs]
     found: list[list[list[float]]] = [[] for _ in arguments.programs]
     for _ in range(arguments.n):
-        for program, medians in zip(arguments.programs, found, strict=True):
+        for program, read, medians in zip(arguments.programs, numbers, found, strict=True):
             command = [program, __file__, "--measure", "--steps", str(arguments.steps)]
-            done = subprocess.run(command, capture_output=True, text=True)
-            assert done.returncode == 0, done.stderr
-            medians.append(json.loads(done.stdout.splitlines()[-1]))
+            medians.append(output_of(command, dict(os.environ), read))
     for program, medians in zip(arguments.programs, found, strict=True):
         print(program)
         for name, values in zip(("step", "without launch"), zip(*medians, strict=True), strict=True):
