@@ -234,6 +234,8 @@ class _Composite(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor]:
         inputs = CompositingInputs(means2d, factors, opacities, features)
         images, ctx.kept = compositor.forward(inputs, keep)
+        ctx.set_materialize_grads(False)
+        ctx.shapes = [x.shape for x in images]
         ctx.compositor = compositor
         ctx.absgrad_hook = absgrad_hook
         ctx.save_for_backward(*inputs)
@@ -241,13 +243,15 @@ class _Composite(torch.autograd.Function):
         return images
 
     @staticmethod
-    def backward(ctx: Any, grad_sums: Tensor, grad_transmittance: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         if torch.is_grad_enabled():
             raise RuntimeError("composite: expected backward without create_graph, there is no second derivative")
         needs = ctx.needs_input_grad[:4]
         inputs = CompositingInputs(*ctx.saved_tensors)
+        like = inputs.features
+        sums, transmittance = (like.new_zeros(ctx.shapes[i]) if grads[i] is None else grads[i] for i in range(2))
         # the state is freed after its first use; a second backward pass computes it again
-        gradients, absgrad = ctx.compositor.backward(inputs, _take(ctx), grad_sums, grad_transmittance, needs)
+        gradients, absgrad = ctx.compositor.backward(inputs, _take(ctx), sums, transmittance, needs)
         if absgrad is not None:
             ctx.absgrad_hook(absgrad)
         return *gradients, None, None, None

@@ -22,7 +22,7 @@ def kernels():
 @pytest.mark.parametrize("target", TARGETS)
 def test_the_kernels_of_a_training_step_compile_and_none_spills(kernels, target):
     spilled = spilled_bytes(kernels["training step"], target)
-    assert len(spilled) == len(kernels["training step"]) >= 15
+    assert len(spilled) == len(kernels["training step"]) >= 18
     assert not [pair for pair in spilled if pair[1] != 0]
 
 
@@ -31,7 +31,7 @@ def test_every_form_of_every_kernel_compiles_and_none_spills(kernels, target):
     """Several cameras and their gradients, absolute gradients, median depths, features, row slices."""
     spilled = spilled_bytes(kernels["every form"], target)
     names = {kernel["name"] for kernel in kernels["training step"]}
-    assert {name for name, _ in spilled} == names
+    assert {name for name, _ in spilled} == names | {"count_entries"}  # of several cameras, and of row slices
     assert len(spilled) >= len(names) + 8
     assert not [pair for pair in spilled if pair[1] != 0]
 

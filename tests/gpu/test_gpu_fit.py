@@ -18,12 +18,12 @@ from kgs.fit.plan import make_plan
 from kgs.init_points import InitialPoints
 
 CPU = torch.device("cpu")
-MAX_LAUNCHES, MAX_WAITS = 150, 4  # of a training step on a GPU
+MAX_LAUNCHES, MAX_WAITS = 75, 1  # of a training step on a GPU
 # operators that compute nothing, and those that wait for a number
 _FREE = (
-    "alias as_strided detach empty empty_like empty_strided expand lift_fresh new_empty permute reshape select slice"
+    "alias as_strided detach empty empty_like empty_strided expand lift_fresh new_empty permute reshape resize_ select"
 )
-_FREE += " split split_with_sizes squeeze t transpose unbind unsqueeze view _reshape_alias _unsafe_view"
+_FREE += " slice split split_with_sizes squeeze t transpose unbind unsqueeze view _reshape_alias _unsafe_view"
 _FREE += " _record_function_enter_new _record_function_exit"
 _WAITS = ("_local_scalar_dense", "nonzero", "masked_select", "equal")
 
@@ -47,7 +47,8 @@ def trainer(scene, points, backend, **options):
 def test_a_step_is_few_launches_and_waits(scene, few, monkeypatch):
     fit = trainer(scene, few, "triton")
     fit._look_every = 20  # as on a GPU
-    fit.train_step()
+    for _ in range(3):  # the first step with each view reads its camera, and the first of each turn their order
+        fit.train_step()
     kernels, waits, real = collections.Counter(), [], torch.Tensor.tolist
 
     def launch(kernel, *arguments, **options):
@@ -63,7 +64,7 @@ def test_a_step_is_few_launches_and_waits(scene, few, monkeypatch):
         fit.train_step()
     found = collections.Counter(operators.names)
     calls = sum(count for name, count in found.items() if name not in _FREE.split())
-    only_here = 2  # the layer looks at opacities where that costs nothing
+    only_here = 3  # the model looks at scales, the background at its colour, the loss at its gradient: free on a CPU
     waited = len(waits) + sum(found[name] for name in _WAITS) - only_here
     assert sum(kernels.values()) >= 10
     assert sum(kernels.values()) + calls <= MAX_LAUNCHES

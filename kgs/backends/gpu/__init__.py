@@ -1,9 +1,10 @@
 """The backend of Triton kernels, for float32 on GPUs.
 
 `projection_kernels`, `compositing_kernels` and `loss_kernels` have the kernels of a stage, and `projection`,
-`compositing` and `loss` bring them to torch; the other files of kernels are parts of these. Torch defines what is
-right; a kernel gives the same within the rounding of float32, and its formulas are explained in the torch code that it
-follows. `import kgs` does not import triton: a stage is imported when it is first used.
+`compositing` and `loss` bring them to torch; the other files of kernels are parts of these. `launch` calls them, and
+`counted` tells compositing what projection has counted. Torch defines what is right; a kernel gives the same within the
+rounding of float32, and its formulas are explained in the torch code that it follows. `import kgs` does not import
+triton: a stage is imported when it is first used.
 
 With TRITON_INTERPRET=1 in the environment the kernels run on a CPU, slowly: so they are tested without a GPU.
 
@@ -11,9 +12,11 @@ Rules:
 
 1. A program writes what no other program writes, and nothing is added atomically: the same bits in each run.
 2. A number is read from the device only where the size of a tensor follows from it, and with it whether torch must
-   do the call: reading waits for all work.
+   do the call: reading waits for all work. A render of one camera reads once.
 3. What a kernel is called with is checked before; it clamps nothing but the indices of masked lanes.
-4. Constants of a module stand to the right of operators; block shapes are powers of two; a loop whose end depends on
+4. Integers that change in a fit, as the number of Gaussians does, are named in `do_not_specialize`: Triton would
+   compile again in the midst of it.
+5. Constants of a module stand to the right of operators; block shapes are powers of two; a loop whose end depends on
    data is a `while` on a scalar.
 """
 

@@ -1,7 +1,8 @@
 """Kernels that find which Gaussian reaches which tile; the spans are those of `kgs.backends.torch.binning`.
 
 A lane is a Gaussian, in depth order. `count_entries` and `fill_entries` go through the same rows of tiles and columns,
-so that each Gaussian writes its entries where the sum of the counts before it says.
+so that each Gaussian writes its entries where the sum of the counts before it says. `count_all_entries` counts before
+it is known how many Gaussians there are.
 """
 
 import triton
@@ -16,9 +17,15 @@ _TWICE_LN2: tl.constexpr = tl.constexpr(1.3862943611198906)
 _WIDER: tl.constexpr = tl.constexpr(1e-3)  # see `kgs.projection.cut_squared`
 
 
-@triton.jit
-def fill_table(order, means2d, factors, opacities, depths, eps2d, n, table, BLOCK: tl.constexpr):
-    """What compositing reads of each Gaussian; see `.compositing_kernels`."""
+@triton.jit(do_not_specialize=["n"])
+def fill_table(
+    order, means2d, factors, opacities, depths, eps2d, n, table, counts, sorted_counts, begins,
+    COUNTED: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """What compositing reads of each Gaussian; see `.compositing_kernels`.
+
+    With `COUNTED` also their `counts` in depth order, and the 0 with which `begins` begins.
+    """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = i < n
     g = tl.load(order + i, mask=inside, other=0)
@@ -41,6 +48,9 @@ def fill_table(order, means2d, factors, opacities, depths, eps2d, n, table, BLOC
     tl.store(row + 5, tl.where(wide, along, 0.0), mask=inside)
     tl.store(row + 6, tl.where(wide, 0.0, along), mask=inside)
     tl.store(row + 7, tl.load(depths + g, mask=inside, other=0.0), mask=inside)
+    if COUNTED:
+        tl.store(sorted_counts + i, tl.load(counts + g, mask=inside, other=0), mask=inside)
+        tl.store(begins + i, i.to(tl.int64), mask=i == 0)
 
 
 @triton.jit
@@ -84,18 +94,12 @@ def _span(row, active, x, y, half, cut, slope, across, inverse, rightmost, width
     return first, tl.where(reaches, last - first + 1, 0)
 
 
-@triton.jit(do_not_specialize=["begin", "end"])
-def count_entries(
-    order, means2d, factors, opacities, camera_ids, eps2d, log2_threshold, height, width, image_rows, begin, end, n,
-    counts,
+@triton.jit
+def _count(
+    means2d, factors, opacities, g, inside, eps2d, log2_threshold, height, width, first_row, last_row,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """How many tiles each Gaussian reaches in the rows of tiles `begin` to `end`, numbered through all cameras."""
-    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    inside = i < n
-    g = tl.load(order + i, mask=inside, other=0)
-    top = tl.load(camera_ids + g, mask=inside, other=0).to(tl.int32) * image_rows
-    first_row, last_row = tl.maximum(begin - top, 0), tl.minimum(end - top, image_rows)
+    """How many tiles each Gaussian reaches in some rows of tiles of one image."""
     row, stop, x, y, half, cut, slope, across, inverse, rightmost = _reach(
         means2d, factors, opacities, g, inside, eps2d, log2_threshold, height, first_row, last_row
     )
@@ -106,10 +110,60 @@ def count_entries(
         total += count
         row += 1
         left -= 1
+    return total
+
+
+@triton.jit
+def count_all_entries(
+    numbers, means2d, factors, opacities, eps2d, log2_threshold, height, width, image_rows, counts, sums,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
+    """How many tiles each of the first `numbers[0]` Gaussians reaches, all of one camera, and each block of them."""
+    b = tl.program_id(0)
+    i = b * BLOCK + tl.arange(0, BLOCK)
+    inside = i < tl.load(numbers)
+    total = _count(
+        means2d, factors, opacities, i.to(tl.int64), inside, eps2d, log2_threshold, height, width, 0, image_rows, BLOCK
+    )
     tl.store(counts + i, total, mask=inside)
+    tl.store(sums + b, tl.sum(total.to(tl.int64), 0))
 
 
-@triton.jit(do_not_specialize=["begin", "end"])
+@triton.jit(do_not_specialize=["blocks"])
+def sum_counts(sums, blocks, out, BLOCK: tl.constexpr):
+    """The sum of all blocks; one program."""
+    i = tl.arange(0, BLOCK)
+    total = tl.zeros((BLOCK,), tl.int64)
+    first = 0
+    while first < blocks:
+        total += tl.load(sums + first + i, mask=first + i < blocks, other=0)
+        first += BLOCK
+    tl.store(out, tl.sum(total, 0))
+
+
+@triton.jit(do_not_specialize=["begin", "end", "n"])
+def count_entries(
+    order, means2d, factors, opacities, camera_ids, eps2d, log2_threshold, height, width, image_rows, begin, end, n,
+    counts, begins,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
+    """How many tiles each Gaussian reaches in the rows of tiles `begin` to `end`, numbered through all cameras.
+
+    And the 0 with which `begins` begins.
+    """
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    inside = i < n
+    g = tl.load(order + i, mask=inside, other=0)
+    top = tl.load(camera_ids + g, mask=inside, other=0).to(tl.int32) * image_rows
+    first_row, last_row = tl.maximum(begin - top, 0), tl.minimum(end - top, image_rows)
+    total = _count(
+        means2d, factors, opacities, g, inside, eps2d, log2_threshold, height, width, first_row, last_row, BLOCK
+    )
+    tl.store(counts + i, total, mask=inside)
+    tl.store(begins + i, i.to(tl.int64), mask=i == 0)
+
+
+@triton.jit(do_not_specialize=["begin", "end", "n"])
 def fill_entries(
     order, means2d, factors, opacities, camera_ids, eps2d, log2_threshold, height, width, image_rows, begin, end, n,
     columns, begins, tiles, ranks,
@@ -117,7 +171,8 @@ def fill_entries(
 ):  # fmt: skip
     """The tiles that each Gaussian reaches, from `begins[i]` on, and beside them its rank in depth order.
 
-    At most as many as were counted: a compiler may round one of the two kernels otherwise, at the edge of a tile.
+    As many as were counted: a compiler may round one of the two kernels otherwise, at the edge of a tile. What is
+    missing lies behind all tiles.
     """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = i < n
@@ -143,3 +198,28 @@ def fill_entries(
         at += count
         row += 1
         left -= 1
+    missing = tl.max(full - at, 0)
+    while missing > 0:
+        tl.store(tiles + at, at.to(tl.int32) * 0 + (end - begin) * columns, mask=at < full)
+        at += 1
+        missing -= 1
+
+
+@triton.jit(do_not_specialize=["entries", "tiles", "steps"])
+def list_tiles(keys, slots, ranks, entries, tiles, steps, listed, offsets, BLOCK: tl.constexpr):
+    """The ranks in the order of the sorted tiles `keys`, and where each tile begins, found in `steps` halvings."""
+    first = tl.program_id(0).to(tl.int64) * BLOCK
+    i = first + tl.arange(0, BLOCK)
+    inside = i < entries
+    slot = tl.load(slots + i, mask=inside, other=0)
+    tl.store(listed + i, tl.load(ranks + slot, mask=inside, other=0), mask=inside)
+    low, high = i * 0, i * 0 + entries
+    left = tl.where(first <= tiles, steps, 0)
+    while left > 0:
+        middle = low + (high - low) // 2
+        searched = low < high
+        before = tl.load(keys + middle, mask=searched, other=0).to(tl.int64) < i
+        low = tl.where(searched & before, middle + 1, low)
+        high = tl.where(searched & (before == 0), middle, high)
+        left -= 1
+    tl.store(offsets + i, low, mask=i <= tiles)

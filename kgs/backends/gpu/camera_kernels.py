@@ -1,7 +1,8 @@
 """What kernels read of a pinhole camera, as one row of numbers; and the gradients of cameras.
 
 A row, `WIDTH` numbers: world to camera (3, 4), intrinsics (2, 3), limits of x / z, then of y / z, the centre (3,),
-whether the kernels cover it, and the inverse of the pose's 3x3 block.
+whether the kernels cover it, the inverse of the pose's 3x3 block, and `kgs.projection.visibility_cutoff`, which is the
+same for all cameras.
 """
 
 import triton
@@ -12,8 +13,12 @@ from .footprint_kernels import is_finite
 WIDTH = 36
 COVERED = 25  # column: 1 for finite numbers, focal lengths other than 0, and an affine, invertible pose; else 0
 
+CUTOFF = 35  # column: how many standard deviations of a footprint count as visible
+
 _WIDTH: tl.constexpr = tl.constexpr(WIDTH)
 _COVERED: tl.constexpr = tl.constexpr(COVERED)
+_CUTOFF: tl.constexpr = tl.constexpr(CUTOFF)
+_WIDER: tl.constexpr = tl.constexpr(1e-3)  # see `kgs.projection.cut_squared`
 
 
 @triton.jit
@@ -34,7 +39,24 @@ def _store_limits(out, focal, centre, low, high, margin):
 
 
 @triton.jit
-def describe_cameras(intrinsics, extrinsics, left, top, right, bottom, margin_x, margin_y, rows):
+def _store_cutoff(out, largest, blocks, threshold, BLOCK: tl.constexpr):
+    """The number of standard deviations that count as visible, by the largest opacities of blocks of Gaussians."""
+    i = tl.arange(0, BLOCK)
+    peak = tl.zeros((BLOCK,), tl.float32) + 2.0
+    first = 0
+    while first < blocks:
+        peak = tl.maximum(peak, tl.load(largest + first + i, mask=first + i < blocks, other=0.0))
+        first += BLOCK
+    cut = 2.0 * tl.log(tl.max(peak, 0) / threshold) + _WIDER
+    cut = tl.where(threshold > 0.0, cut, float("inf"))
+    tl.store(out, tl.sqrt(tl.maximum(cut, 9.0)))
+
+
+@triton.jit(do_not_specialize=["blocks"])
+def describe_cameras(
+    intrinsics, extrinsics, left, top, right, bottom, margin_x, margin_y, largest, blocks, threshold, rows,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
     """Fill the row of a camera from its matrices `(4, 4)`; the last rows of the intrinsics have been checked."""
     c = tl.program_id(0)
     matrix, pose, out = intrinsics + c * 16, extrinsics + c * 16, rows + c * _WIDTH
@@ -62,3 +84,4 @@ def describe_cameras(intrinsics, extrinsics, left, top, right, bottom, margin_x,
             moved -= inverse * tl.load(pose + 4 * m + 3)
         tl.store(out + 22 + j, moved)
     tl.store(out + _COVERED, covered.to(tl.float32))
+    _store_cutoff(out + _CUTOFF, largest, blocks, threshold, BLOCK)

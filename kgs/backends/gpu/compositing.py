@@ -1,6 +1,5 @@
 """Compositing by the kernels: lists, images, gradients."""
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,14 +9,16 @@ from torch import Tensor
 from kgs.backends.base import CompositingCall, CompositingInputs, Compositor, Images
 from kgs.backends.row_slices import check_fits
 
-from .binning_kernels import count_entries, fill_entries, fill_table
+from . import counted
+from .binning_kernels import count_entries, fill_entries, fill_table, list_tiles
 from .compositing_kernels import FEATURES, ROW, SIZE, K, composite_backward, composite_forward, sum_entries
 from .launch import blocks, launch
 
 _TINY = 2.0**-125  # smaller alphas and T are 0: products with them would be denormal
 # bytes of an entry: tile and rank, both sorted, its slot, memory of the sort; its share of T; its row of moments
 _PER_ENTRY = 4 * (2 + 2 + 2 + 4 + SIZE * SIZE // K + ROW)
-_LANES = 32  # Gaussians of a program that goes through their tiles
+LANES = 32  # Gaussians of a program that goes through their tiles
+_BLOCK = 128  # Gaussians or entries of another
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,10 @@ class _Lists:
 
 
 class GpuCompositor(Compositor):
-    """Compositing of one call; its constructor reads one number for each row slice that it tries."""
+    """Compositing of one call.
+
+    Its constructor reads one number for each row slice that it tries; none for the first where the projection counted.
+    """
 
     def __init__(self, call: CompositingCall) -> None:
         projected = call.projected
@@ -58,14 +62,19 @@ class GpuCompositor(Compositor):
         self._absgrad = options.absgrad
         self._thresholds = (max(options.alpha_threshold, _TINY), max(options.transmittance_stop, _TINY))
         self._order = torch.argsort(depths, stable=True)
-        self._table = depths.new_empty(len(projected), 8)
+        n = len(projected)
+        self._table = depths.new_empty(n, 8)
         footprints = (means2d, factors, opacities)
-        arguments = (self._order, *footprints, depths, self._eps2d, len(projected), self._table)
-        launch(fill_table, (blocks(len(projected), 128),), *arguments, BLOCK=128)
-        log2_threshold = math.log2(options.alpha_threshold) if options.alpha_threshold else -math.inf
+        known = counted.find(projected, options.alpha_threshold) if n else None
+        counts, begins = self._room() if known else (self._order, self._order)  # or what nothing is written to
+        arguments = (self._order, *footprints, depths, self._eps2d, n, self._table)
+        sorting = (known.counts if known else counts, counts, begins)
+        launch(fill_table, (blocks(n, _BLOCK),), *arguments, *sorting, COUNTED=known is not None, BLOCK=_BLOCK)
+        log2_threshold = counted.log2_threshold(options.alpha_threshold)
         ellipses = (self._order, *footprints, projected.camera_ids.contiguous(), self._eps2d, log2_threshold)
         self._ellipses = (*ellipses, *self._size, self._image_rows)
-        self._slices = self._fitting(0, self._cameras * self._image_rows, options.max_bytes)
+        whole = (_add_up(counts, begins), known.entries) if known else None
+        self._slices = self._fitting(0, self._cameras * self._image_rows, options.max_bytes, whole)
 
     def forward(self, inputs: CompositingInputs, keep: bool) -> tuple[Images, Any]:
         """See `Compositor`. One row slice is kept, several are computed again."""
@@ -89,7 +98,7 @@ class GpuCompositor(Compositor):
         n, channels = features.shape
         needs_absolute = self._absgrad and needs[0]
         input_grads = [x.new_empty(x.shape) for x in inputs]
-        absolute = features.new_empty((n, 2) if needs_absolute else (0,))
+        absolute = features.new_empty(n, 2) if needs_absolute else features  # to which nothing is written
         factors = inputs.factors.contiguous()
         opacities = inputs.opacities.contiguous()
         grads = grad_features.contiguous()
@@ -124,18 +133,30 @@ class GpuCompositor(Compositor):
         gradients = tuple(x if need else None for x, need in zip(input_grads, needs, strict=True))
         return gradients, absolute if needs_absolute else None
 
-    def _fitting(self, begin: int, end: int, max_bytes: int) -> list[_Rows]:
-        """Row slices of the rows `begin` to `end` whose lists take at most `max_bytes`: halves, where they do not."""
+    def _room(self) -> tuple[Tensor, Tensor]:
+        """For the entries of each Gaussian, and for where they begin."""
         n = len(self._order)
         counts = self._order.new_empty(n, dtype=torch.int32)
-        launch(count_entries, (blocks(n, _LANES),), *self._ellipses, begin, end, n, counts, BLOCK=_LANES, warps=1)
-        begins = self._order.new_zeros(n + 1)
-        torch.cumsum(counts, 0, out=begins[1:])
-        entries = int(begins[-1])
+        return counts, self._order.new_empty(n + 1) if n else self._order.new_zeros(1)
+
+    def _count(self, begin: int, end: int) -> tuple[Tensor, int]:
+        """Where the entries of each Gaussian begin in some rows of tiles, and how many there are: a wait."""
+        n = len(self._order)
+        counts, begins = self._room()
+        rows = (begin, end, n, counts, begins)
+        launch(count_entries, (blocks(n, LANES),), *self._ellipses, *rows, BLOCK=LANES, warps=1)
+        return begins, int(_add_up(counts, begins)[-1])
+
+    def _fitting(self, begin: int, end: int, max_bytes: int, known: tuple[Tensor, int] | None = None) -> list[_Rows]:
+        """Row slices of the rows `begin` to `end` whose lists take at most `max_bytes`: halves, where they do not.
+
+        `known` are the counts of all these rows.
+        """
+        begins, entries = self._count(begin, end) if known is None else known
         size = entries * _PER_ENTRY + (end - begin) * self._columns * SIZE * SIZE * 4
         if size > max_bytes and end - begin > 1:
             middle = (begin + end) // 2
-            del counts, begins
+            del begins, known
             return self._fitting(begin, middle, max_bytes) + self._fitting(middle, end, max_bytes)
         check_fits(size, max_bytes)
         return [_Rows(begin, end, begins, entries)]
@@ -149,13 +170,16 @@ class GpuCompositor(Compositor):
         n = len(self._order)
         tiles = (rows.end - rows.begin) * self._columns
         kind = torch.int16 if tiles < 2**15 else torch.int32  # sorted in half the time
-        keys = self._order.new_full((rows.entries,), tiles, dtype=kind)  # behind all tiles
+        keys = self._order.new_empty(rows.entries, dtype=kind)
         ranks = self._order.new_empty(rows.entries, dtype=torch.int32)
-        where = (rows.begin, rows.end, n, self._columns, rows.begins, keys, ranks)  # as many as were counted, or fewer
-        launch(fill_entries, (blocks(n, _LANES),), *self._ellipses, *where, BLOCK=_LANES, warps=1)
+        where = (rows.begin, rows.end, n, self._columns, rows.begins, keys, ranks)
+        launch(fill_entries, (blocks(n, LANES),), *self._ellipses, *where, BLOCK=LANES, warps=1)
         keys, slots = torch.sort(keys, stable=True)
-        offsets = torch.searchsorted(keys, torch.arange(tiles + 1, dtype=kind, device=keys.device))
-        entries = ranks.index_select(0, slots)
+        entries = torch.empty_like(ranks)
+        offsets = self._order.new_empty(tiles + 1)
+        lists = (rows.entries, tiles, rows.entries.bit_length(), entries, offsets)
+        grid = (blocks(max(rows.entries, tiles + 1), _BLOCK),)
+        launch(list_tiles, grid, keys, slots, ranks, *lists, BLOCK=_BLOCK)
         chunks = rows.entries // K + tiles if keep else 0
         starts = features.new_empty(chunks, SIZE * SIZE)
         reached = self._order.new_empty(tiles, dtype=torch.int32)
@@ -170,3 +194,9 @@ class GpuCompositor(Compositor):
             warps=1,
         )
         return _Lists(entries, slots, offsets, starts, reached)
+
+
+def _add_up(counts: Tensor, begins: Tensor) -> Tensor:
+    """Fill all but the first of `begins`, which is 0, with the sums of the counts up to each; returns it."""
+    torch.cumsum(counts, 0, out=begins[1:])
+    return begins

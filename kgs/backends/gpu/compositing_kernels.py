@@ -233,7 +233,7 @@ def composite_backward(
         chunk -= 1
 
 
-@triton.jit(do_not_specialize=["f0"])
+@triton.jit(do_not_specialize=["f0", "n"])
 def sum_entries(
     order, begins, moments, factors, opacities, eps2d, n, channels, f0, d_means2d, d_factors, d_opacities, d_features,
     d_absolute,

@@ -1,10 +1,25 @@
-"""How kernels are called."""
+"""How kernels are called.
 
+Triton looks at every argument of every call for what the kernel is to be compiled for, which takes longer than small
+kernels run. On NVIDIA's and AMD's GPUs `launch` therefore keeps what Triton compiled, by :func:`specialization`, and
+gives it the pointers from the second call on. What the environment says to Triton counts when a kernel is first called.
+"""
+
+import functools
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import torch
+import triton
 from torch import Tensor
+
+_DIRECT = ("cuda",)  # types of devices; what Triton compiles for on Intel's is not known here
+_HOOKS = ("launch_enter_hook", "launch_exit_hook", "add_stages_inspection_hook")
+_MAX_SMALL = 2**31 - 1  # bytes; kernels for AMD's GPUs address tensors of more than that otherwise
+_IS_AMD = torch.version.hip is not None
+
+_compiled: dict[Any, Any] = {}  # by the key of `specialization`
+_arguments: dict[int, tuple[Any, tuple[bool, ...]]] = {}  # by its id a kernel, which thereby stays, and see below
 
 
 def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, warps: int = 4, **constants: Any) -> None:
@@ -13,16 +28,106 @@ def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, warps: int = 4, 
     Args:
         kernel: of one of the modules `X_kernels`.
         grid: how many programs, along at most three axes; nothing happens where one is 0.
-        arguments: of the kernel, in their order; tensors are contiguous.
+        arguments: of the kernel, in their order: tensors, which are contiguous, and numbers.
         warps: of each program.
-        constants: arguments that the kernel is compiled for.
+        constants: arguments that the kernel is compiled for, in their order, behind all others.
     """
     if not all(grid):
         return
-    first = next(x for x in arguments if isinstance(x, Tensor))
-    with _current(first.device):
-        # products are fused with sums, in every version of Triton: from 3.10 on it is not the default
-        kernel[grid](*arguments, **constants, num_warps=warps, enable_fp_fusion=True)
+    device = _device_of(arguments)
+    if device.type not in _DIRECT or _is_watched(kernel):
+        with _current(device):
+            _launch_by_triton(kernel, grid, arguments, warps, constants)
+        return
+    key, values = specialization(kernel, arguments, (device.index, warps, *constants.items()))
+    compiled = _compiled.get(key)
+    with _current(device):
+        if compiled is None:
+            compiled = _launch_by_triton(kernel, grid, arguments, warps, constants)
+            if key is not None and all(hasattr(compiled, x) for x in ("run", "function", "packed_metadata")):
+                _compiled[key] = compiled
+            return
+        if hasattr(kernel, "device_caches"):  # since Triton 3.3
+            values += constants.values()
+        size = (*grid, 1, 1)[:3]
+        nothing = (None, None, None)  # for hooks
+        compiled.run(*size, _stream(device), compiled.function, compiled.packed_metadata, *nothing, *values)
+
+
+def specialization(kernel: Any, arguments: tuple[Any, ...], rest: tuple[Any, ...]) -> tuple[Any, list[Any]]:
+    """A key that differs where Triton would compile a kernel anew, and the arguments with pointers for tensors.
+
+    Triton compiles for the dtype of a tensor and whether its pointer is a multiple of 16, for integers of 32 and 64
+    bits and, unless a kernel says `do_not_specialize`, for those that are 1 or a multiple of 16; on AMD's GPUs for
+    small tensors, too.
+
+    Args:
+        kernel: as Triton's `jit` returns it.
+        arguments: that are not constants.
+        rest: what else goes into the key.
+
+    Returns:
+        The key is None where an argument is neither a tensor nor a number.
+    """
+    key: list[Any] = [id(kernel), *rest]
+    values: list[Any] = []
+    for value, as_it_is in zip(arguments, _not_specialized(kernel), strict=False):
+        if isinstance(value, Tensor):
+            pointer = value.data_ptr()
+            key += (value.dtype, pointer % 16 == 0)
+            if _IS_AMD:
+                key.append(value.untyped_storage().nbytes() <= _MAX_SMALL)
+            values.append(pointer)
+            continue
+        values.append(value)
+        if isinstance(value, float | bool):
+            key.append(type(value))
+        elif isinstance(value, int):
+            key.append(_bits(value))
+            if not as_it_is:
+                key.append("one" if value == 1 else "multiple" if value % 16 == 0 else "any")
+        else:
+            return None, values
+    return tuple(key), values
+
+
+def _bits(value: int) -> int:
+    """Of the type that Triton gives an integer; negative for one with a sign."""
+    if -(2**31) <= value < 2**31:
+        return -32
+    return 64 if value >= 2**63 else -64
+
+
+def _launch_by_triton(
+    kernel: Any, grid: tuple[int, ...], arguments: tuple[Any, ...], warps: int, constants: dict[str, Any]
+) -> Any:
+    """Launch as Triton documents it; returns what was compiled, or None."""
+    # products are fused with sums, in every version of Triton: from 3.10 on it is not the default
+    return kernel[grid](*arguments, **constants, num_warps=warps, enable_fp_fusion=True)
+
+
+def _is_watched(kernel: Any) -> bool:
+    """Whether something wants to hear of each launch, as a profiler does: Triton tells it."""
+    settings = _settings()
+    hooks = [getattr(settings, name, None) for name in _HOOKS]
+    return bool(kernel.pre_run_hooks) or any(hook is not None and getattr(hook, "calls", True) for hook in hooks)
+
+
+@functools.cache
+def _settings() -> Any:
+    """What has the hooks of Triton."""
+    if hasattr(triton, "knobs"):  # since Triton 3.4
+        return triton.knobs.runtime
+    return triton.compiler.CompiledKernel
+
+
+def _not_specialized(kernel: Any) -> tuple[bool, ...]:
+    """Of each argument of a kernel whether its value is left aside."""
+    known = _arguments.get(id(kernel))  # the hash of a kernel is that of its source
+    if known is None:
+        known = (kernel, tuple(x.do_not_specialize for x in kernel.params))
+        _arguments[id(kernel)] = known
+    return known[1]
 
 
 def wide_sum(values: Tensor, dim: int) -> Tensor:
@@ -35,9 +140,23 @@ def blocks(count: int, size: int) -> int:
     return -(-count // size)
 
 
+def _device_of(arguments: tuple[Any, ...]) -> torch.device:
+    """The device of the first tensor."""
+    return next(x.device for x in arguments if isinstance(x, Tensor))
+
+
+def _stream(device: torch.device) -> int:
+    """The stream on which torch works."""
+    stream: int = triton.runtime.driver.active.get_current_stream(device.index)
+    return stream
+
+
 def _current(device: torch.device) -> AbstractContextManager[Any]:
     """Makes the device the current one, where there are several of its kind: Triton launches on that one."""
     if device.type == "cpu" or device.index is None:
         return nullcontext()
-    context: AbstractContextManager[Any] = torch.get_device_module(device).device(device.index)
+    module = torch.get_device_module(device)
+    if device.index == module.current_device():
+        return nullcontext()
+    context: AbstractContextManager[Any] = module.device(device.index)
     return context

@@ -1,6 +1,7 @@
 """Projection by the kernels: pinhole cameras; others go to torch."""
 
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -10,14 +11,18 @@ from torch import Tensor
 
 from kgs.backends.torch.projection import project as project_in_torch
 from kgs.camera import MARGIN, Cameras, whole_frame
-from kgs.projection import visibility_cutoff
 from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
 
-from .camera_kernels import COVERED, WIDTH, describe_cameras
+from . import counted
+from .binning_kernels import count_all_entries, sum_counts
+from .camera_kernels import WIDTH, describe_cameras
+from .compositing import LANES
+from .compositing_kernels import SIZE
 from .launch import blocks, launch, wide_sum
-from .projection_kernels import check_gaussians, find_visible, footprint_gradients, list_visible
+from .projection_kernels import check_gaussians, find_visible, footprint_gradients, list_visible, number_rows
 
 _BLOCK = 128  # Gaussians of a program
+_SUMS = 1024  # numbers that a single program takes at once
 
 
 def project(
@@ -27,17 +32,16 @@ def project(
     near = options.near_plane < 1e-8  # Kornia does not divide by less
     if not isinstance(cameras, PinholeCamera) or gaussians.quats.ndim == 3 or near:
         return project_in_torch(gaussians, cameras, size, options, colors)
-    visible = _find_visible(gaussians, cameras, size, options)
-    if visible is None:
-        return project_in_torch(gaussians, cameras, size, options, colors)
     harmonics = colors and gaussians.colors.ndim == 3
+    listed = _list(gaussians, cameras, size, options, gaussians.colors.shape[1] if harmonics else 0)
+    if listed is None:
+        return project_in_torch(gaussians, cameras, size, options, colors)
     inputs = (*vars(gaussians).values(), cameras.extrinsics, cameras.intrinsics)
-    fields = _Projection.apply(*inputs, visible, options.near_plane, options.eps2d, harmonics)
-    means2d, factors, depths, alphas, rgb, radii, camera_ids, ids = fields
+    means2d, factors, depths, alphas, rgb, radii, camera_ids, ids = _Projection.apply(*inputs, listed, harmonics)
     if colors and not harmonics:
         # camera by camera: the gradients of equal rows would be added up in any order
-        rgb = torch.cat([gaussians.colors.index_select(0, part) for part in ids.split(visible.counts)])
-    return ProjectedGaussians(
+        rgb = torch.cat([gaussians.colors.index_select(0, part) for part in ids.split(listed.seen)])
+    projected = ProjectedGaussians(
         camera_ids,
         ids,
         means2d,
@@ -49,91 +53,148 @@ def project(
         image_size=size,
         num_cameras=len(cameras.extrinsics),
         num_gaussians=len(gaussians),
-        num_nonfinite=visible.num_nonfinite,
+        num_nonfinite=listed.visible.numbers[len(cameras.extrinsics)],
         eps2d=options.eps2d,
     )
+    if listed.entries is not None:
+        counted.remember(projected, options.alpha_threshold, *listed.entries)
+    return projected
 
 
 @dataclass(frozen=True)
 class _Visible:
-    """Which pairs (camera, Gaussian) are visible."""
+    """Which pairs (camera, Gaussian) are visible; the tensors are those of `.projection_kernels`."""
 
-    cameras: Tensor  # (C, WIDTH), a row of numbers for each camera, see `.camera_kernels`
-    running_counts: Tensor  # (C N,), how many pairs are visible up to and including each
-    counts: list[int]  # how many Gaussians each camera sees
-    num_nonfinite: Tensor  # 0-d
+    cameras: Tensor  # (C * WIDTH,) and more, see `.camera_kernels`
+    flags: Tensor
+    counts: Tensor
+    numbers: Tensor
 
 
-def _find_visible(
-    gaussians: Gaussians, cameras: PinholeCamera, size: tuple[int, int], options: RasterOptions
-) -> _Visible | None:
-    """What the cameras see; None where the kernels do not cover one of the cameras, or there are no Gaussians."""
+@dataclass(frozen=True)
+class _Listed:
+    """The visible pairs, row by row."""
+
+    visible: _Visible
+    fields: tuple[Tensor, ...]  # means2d, factors, depths, opacities, colours and radii, without graph
+    camera_ids: Tensor
+    ids: Tensor
+    seen: list[int]  # how many Gaussians each camera sees
+    entries: tuple[Tensor, int] | None  # of one camera: how many tiles each Gaussian reaches, and their sum
+
+
+def _list(
+    gaussians: Gaussians, cameras: PinholeCamera, size: tuple[int, int], options: RasterOptions, bands: int
+) -> _Listed | None:
+    """What the cameras see; None where the kernels do not cover one of the cameras, or there are no Gaussians.
+
+    Reads a few numbers once. One camera's list is made before, with room for all Gaussians, so that its entries are
+    counted by then, too.
+    """
     n = len(gaussians)
     if n == 0:
         return None
-    values, opacities, colors = _values(gaussians)
-    rows = _describe(cameras, size, options)
-    finite = values[0].new_empty(n, dtype=torch.int8)
-    largest = values[0].new_empty(blocks(n, _BLOCK))
-    checked = (*values, opacities, colors, n, len(opacities), colors.shape[1], finite, largest)
-    launch(check_gaussians, (blocks(n, _BLOCK),), *checked, BLOCK=_BLOCK)
-    cutoff = visibility_cutoff(largest, options.alpha_threshold)
-    flags = finite.new_empty(len(rows), n, dtype=torch.int32)
-    frustum = (cutoff, options.near_plane, options.eps2d, *size)
-    launch(find_visible, (blocks(n, _BLOCK), len(rows)), *values, finite, rows, *frustum, n, flags, BLOCK=_BLOCK)
-    running_counts = torch.cumsum(flags.view(-1), 0)
-    *ends, covered = torch.cat([running_counts[n - 1 :: n], rows[:, COVERED].amin().long()[None]]).tolist()
+    values = _values(gaussians)
+    visible = _find_visible(values, cameras, size, options)
+    count = len(cameras.extrinsics)
+    counts = None
+    fill = partial(_fill, values, visible, options, bands)
+    if count == 1:
+        found = fill(n)
+        counts = _count_entries(visible, found, size, options)
+        *ends, _, covered, entries = visible.numbers[:4].tolist()
+    else:
+        *ends, _, covered = visible.numbers[: count + 2].tolist()
     if not covered:
         return None
-    counts = [end - begin for begin, end in pairwise([0, *ends])]
-    return _Visible(rows, running_counts, counts, n - finite.sum())
+    if counts is None:
+        *fields, camera_ids, ids = fill(ends[-1])
+        return _Listed(visible, tuple(fields), camera_ids, ids, [j - i for i, j in pairwise([0, *ends])], None)
+    *fields, camera_ids, ids, counts = (x.resize_(ends[0], *x.shape[1:]) for x in (*found, counts))
+    return _Listed(visible, tuple(fields), camera_ids, ids, ends, (counts, entries))
 
 
-def _describe(cameras: PinholeCamera, size: tuple[int, int], options: RasterOptions) -> Tensor:
-    """A row of numbers for each camera, see `.camera_kernels`."""
+def _find_visible(
+    values: list[Tensor], cameras: PinholeCamera, size: tuple[int, int], options: RasterOptions
+) -> _Visible:
+    """Find the visible pairs and number them; reads nothing."""
+    means, quats, scales, opacities, colors = values
+    n = len(means)
     matrices = [x.detach().contiguous() for x in (cameras.intrinsics, cameras.extrinsics)]
+    count = len(matrices[0])
+    among = blocks(n, _BLOCK)
+    rows = means.new_empty(count * WIDTH + among)
+    largest = rows[count * WIDTH :]
+    flags = means.new_empty(count + 1, n, dtype=torch.int8)
+    head = (count + 4) // 2 * 2  # even: pointers stay multiples of 16
+    numbers = means.new_empty(head + (count + 1) * among, dtype=torch.int64)
+    counts = numbers[head:]
+    checked = (*values, n, len(opacities), colors.shape[1], count, among, flags, counts, largest)
+    launch(check_gaussians, (among,), *checked, BLOCK=_BLOCK)
     left, top, right, bottom = options.frame or whole_frame(size)
     margins = (MARGIN * (right - left), MARGIN * (bottom - top))
-    rows = matrices[0].new_empty(len(matrices[0]), WIDTH)
-    launch(describe_cameras, (len(rows),), *matrices, left, top, right, bottom, *margins, rows, warps=1)
-    return rows
+    frame = (left, top, right, bottom, *margins, largest, among, float(options.alpha_threshold), rows)
+    launch(describe_cameras, (count,), *matrices, *frame, BLOCK=_SUMS, warps=1)
+    frustum = (rows, options.near_plane, options.eps2d, *size, n, among, flags, counts)
+    launch(find_visible, (among, count), means, quats, scales, *frustum, BLOCK=_BLOCK)
+    launch(number_rows, (1,), rows, count, n, among, counts, numbers, BLOCK=_SUMS)
+    return _Visible(rows, flags, counts, numbers)
 
 
-def _values(gaussians: Gaussians) -> tuple[list[Tensor], Tensor, Tensor]:
-    """Means, quaternions and scales; opacities `(1, N)` or `(C, N)`; colours `(N, F)`: contiguous, without gradient."""
+def _fill(values: list[Tensor], visible: _Visible, options: RasterOptions, bands: int, room: int) -> tuple[Tensor, ...]:
+    """Fields, cameras and Gaussians of the visible pairs, of which there are at most as many as there is room for."""
+    means, _, _, opacities, _ = values
+    n = len(means)
+    widths = ((2,), (2, 3), (), (), (3 if bands else 0,), ())
+    fields = [means.new_empty(room, *width) for width in widths]
+    ids = [visible.numbers.new_empty(room) for _ in range(2)]
+    among = blocks(n, _BLOCK)
+    flags = (visible.cameras, visible.flags, visible.counts)
+    numbers = (options.near_plane, options.eps2d, n, among, len(opacities))
+    grid = (among, len(visible.flags) - 1)
+    launch(list_visible, grid, *values, *flags, *numbers, *fields, *ids, BANDS=bands, BLOCK=_BLOCK)
+    return *fields, *ids
+
+
+def _count_entries(
+    visible: _Visible, found: tuple[Tensor, ...], size: tuple[int, int], options: RasterOptions
+) -> Tensor:
+    """How many tiles each row reaches; writes the sum into the numbers."""
+    means2d, factors, _, opacities = found[:4]
+    among = blocks(len(means2d), LANES)
+    counts = visible.flags.new_empty(len(means2d), dtype=torch.int32)
+    sums = visible.numbers.new_empty(among)
+    threshold = counted.log2_threshold(options.alpha_threshold)
+    ellipses = (means2d, factors, opacities, options.eps2d, threshold, *size, blocks(size[0], SIZE))
+    launch(count_all_entries, (among,), visible.numbers, *ellipses, counts, sums, BLOCK=LANES, warps=1)
+    launch(sum_counts, (1,), sums, among, visible.numbers[3:], BLOCK=_SUMS)
+    return counts
+
+
+def _values(gaussians: Gaussians) -> list[Tensor]:
+    """Means, quaternions, scales, opacities `(1, N)` or `(C, N)`, colours `(N, F)`: contiguous, without gradient."""
     *values, opacities, colors = (x.detach().contiguous() for x in vars(gaussians).values())
-    return (
-        values,
-        opacities.view(-1, len(gaussians)),
-        colors.view(len(colors), -1) if colors.numel() else colors.flatten(1),
-    )
+    wide = colors.view(len(colors), -1) if colors.numel() else colors.flatten(1)
+    return [*values, opacities.view(-1, len(gaussians)), wide]
 
 
 class _Projection(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
-        means, quats, scales, opacities, colors, _, _, visible, near, eps2d, harmonics = arguments
+        colors, listed, harmonics = arguments[4], arguments[7], arguments[8]
         ctx.save_for_backward(*arguments[:5])  # not the cameras: they may have been made in inference mode
-        ctx.visible = visible
+        ctx.set_materialize_grads(False)
+        ctx.visible = listed.visible
         ctx.harmonics = harmonics
-        n = len(means)
-        count = sum(visible.counts)
         bands = colors.shape[1] if harmonics else 0
-        widths = ((2,), (2, 3), (), (), (3 if harmonics else 0,), ())
-        fields = [means.new_empty(count, *width) for width in widths]
-        camera_ids, ids = (visible.running_counts.new_empty(count) for _ in range(2))
-        values = [x.contiguous() for x in (means, quats, scales, opacities, colors)]
-        options = (visible.cameras, visible.running_counts, near, eps2d, n, opacities.numel() // n)
-        grid = (blocks(n, _BLOCK), len(visible.cameras))
-        launch(list_visible, grid, *values, *options, *fields, camera_ids, ids, BANDS=bands, BLOCK=_BLOCK)
         by_mean, by_turn, by_scale, by_opacity, by_color, by_pose, by_lens = ctx.needs_input_grad[:7]
         by_position = by_mean or by_pose
         by_shape = by_position or by_lens or by_turn or by_scale
         colored = harmonics and (by_color or (by_position and bands > 1))
         differentiable = (by_position or by_lens, by_shape, by_position, by_opacity, colored, False)
-        constant = [x for x, varies in zip(fields, differentiable, strict=True) if not varies]
-        ctx.mark_non_differentiable(*constant, camera_ids, ids)
-        return *fields, camera_ids, ids
+        constant = [x for x, varies in zip(listed.fields, differentiable, strict=True) if not varies]
+        ctx.mark_non_differentiable(*constant, listed.camera_ids, listed.ids)
+        return *listed.fields, listed.camera_ids, listed.ids
 
     @staticmethod
     def backward(ctx: Any, *gradients: Any) -> tuple[Tensor | None, ...]:
@@ -141,32 +202,48 @@ class _Projection(torch.autograd.Function):
             raise RuntimeError("project: expected backward without create_graph, footprints have no second derivative")
         inputs = ctx.saved_tensors
         means, quats, scales, opacities, colors = inputs
-        cameras = ctx.visible.cameras
+        visible = ctx.visible
+        count = len(visible.flags) - 1
         n = len(means)
-        views = opacities.numel() // n
         needs = list(ctx.needs_input_grad[:7])
         needs[4] = needs[4] and ctx.harmonics
+        with_camera = any(needs[5:])
         input_grads = [x.new_empty(x.shape) for x in inputs[:4]]
         input_grads.append(colors.new_empty(colors.shape if needs[4] else (0,)))  # the largest by far
         values = [x.contiguous() for x in (means, quats, scales, colors)]
-        incoming = [x.contiguous() for x in gradients[:5]]
-        poses, intrinsics = means.new_zeros(2, len(cameras), 4, 4)
-        count = blocks(n, _BLOCK)
-        totals = means.new_empty(count, 21)
-        for c in range(len(cameras)):
+        incoming = _incoming(gradients, means, ctx.harmonics)
+        among = blocks(n, _BLOCK)
+        totals = means.new_empty(among, 21) if with_camera else means  # to which nothing is written
+        matrices = means.new_zeros(2, count, 4, 4) if with_camera else None  # poses and intrinsics
+        found = (visible.cameras, visible.flags, visible.counts, n, among, opacities.numel() // n)
+        for c in range(count):
             launch(
                 footprint_gradients,
-                (count,),
-                *(c, *values, cameras, ctx.visible.running_counts, n, views, *incoming, *input_grads, totals),
+                (among,),
+                *(c, *values, *found, *incoming, *input_grads, totals),
                 BANDS=colors.shape[1] if ctx.harmonics else 0,
+                WITH_DEPTHS=gradients[2] is not None,
                 WITH_COLORS=needs[4],
-                WITH_CAMERA=any(needs[5:]),
+                WITH_CAMERA=with_camera,
                 ADD=c > 0,
                 BLOCK=_BLOCK,
             )
-            if any(needs[5:]):
+            if matrices is not None:
                 total = wide_sum(totals, 0).float()
-                poses[c, :3] = total[:12].view(3, 4)
-                intrinsics[c, :3, :3] = total[12:].view(3, 3)
-        input_grads += [poses, intrinsics]
-        return *(x if need else None for x, need in zip(input_grads, needs, strict=True)), None, None, None, None
+                matrices[0, c, :3] = total[:12].view(3, 4)
+                matrices[1, c, :3, :3] = total[12:].view(3, 3)
+        found_grads = [*input_grads, *((None, None) if matrices is None else matrices)]
+        return *(x if need else None for x, need in zip(found_grads, needs, strict=True)), None, None
+
+
+def _incoming(gradients: tuple[Tensor | None, ...], like: Tensor, harmonics: bool) -> list[Tensor]:
+    """The gradients of means2d, factors, depths, opacities and colours; what the kernel does not read is anything."""
+    rows = next((len(x) for x in gradients if x is not None), 0)
+    widths = ((2,), (2, 3), None, (), (3,) if harmonics else None)
+    found = []
+    for gradient, width in zip(gradients, widths, strict=False):
+        if gradient is not None:
+            found.append(gradient.contiguous())
+        else:
+            found.append(like if width is None else like.new_zeros(rows, *width))
+    return found

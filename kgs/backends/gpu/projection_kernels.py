@@ -1,26 +1,35 @@
 """Projection by pinhole cameras with the colours of harmonics, and its gradient: a Gaussian for each lane.
 
 The formulas are those of `kgs.projection`, `kgs.camera` and `kgs.covariance`; a camera is a row of numbers, see
-:mod:`.camera_kernels`. Arrays of N Gaussians and C cameras:
+:mod:`.camera_kernels`. Arrays of N Gaussians, C cameras and B blocks of Gaussians:
 
-    opacities       (1, N) or (C, N)
-    finite          (N,)      whether all of a Gaussian's numbers are
-    running_counts  (C, N)    how many pairs are visible up to and including this one: of a visible pair, its row + 1
+    opacities  (1, N) or (C, N)
+    flags      (C + 1, N)    whether a pair is visible; in the last row, whether all of a Gaussian's numbers are finite
+    counts     (C + 1, B)    how many flags of a block are set; then, of a camera, how many pairs are visible before it
+    numbers    (C + 3,)      how many pairs are visible up to and including each camera, how many Gaussians are not
+                             finite, whether the kernels cover all cameras; of one camera, how many entries there are
+
+The visible pairs are numbered camera by camera, in the order of the Gaussians: their rows.
 """
 
 import triton
 import triton.language as tl
 
-from .camera_kernels import WIDTH
+from .camera_kernels import COVERED, CUTOFF, WIDTH
 from .footprint_kernels import is_finite, load_factors, put, variances
 from .harmonics_kernels import basis, basis_gradient, evaluate
 
 _WIDTH: tl.constexpr = tl.constexpr(WIDTH)
+_COVERED: tl.constexpr = tl.constexpr(COVERED)
+_CUTOFF: tl.constexpr = tl.constexpr(CUTOFF)
 
 
-@triton.jit
-def check_gaussians(means, quats, scales, opacities, colors, n, views, features, finite, largest, BLOCK: tl.constexpr):
-    """Whether each Gaussian is finite; and of each block the largest opacity of those that are."""
+@triton.jit(do_not_specialize=["n", "blocks"])
+def check_gaussians(
+    means, quats, scales, opacities, colors, n, views, features, cameras, blocks, flags, counts, largest,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Whether each Gaussian is finite; and of each block the largest opacity of those that are, and their number."""
     b = tl.program_id(0)
     g = b * BLOCK + tl.arange(0, BLOCK)
     inside = g < n
@@ -44,7 +53,8 @@ def check_gaussians(means, quats, scales, opacities, colors, n, views, features,
         value = tl.load(row + first, mask=inside[:, None] & (f + first < features)[None, :], other=0.0)
         all_finite &= tl.min(is_finite(value).to(tl.int32), 1) > 0
         first += 16
-    tl.store(finite + g, all_finite.to(tl.int8), mask=inside)
+    tl.store(flags + (g * 0 + cameras).to(tl.int64) * n + g, all_finite.to(tl.int8), mask=inside)
+    tl.store(counts + cameras * blocks + b, tl.sum(all_finite.to(tl.int64), 0))
     tl.store(largest + b, tl.max(tl.where(all_finite, maximum, 0.0), 0))
 
 
@@ -154,22 +164,60 @@ def _largest(xx, xy, yy):
     return 0.5 * (xx + yy) + scale * tl.sqrt(half / scale * (half / scale) + xy / scale * (xy / scale))
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["n", "blocks"])
 def find_visible(
-    means, quats, scales, finite, cameras, cutoff, near, eps2d, height, width, n, visible, BLOCK: tl.constexpr
+    means, quats, scales, cameras, near, eps2d, height, width, n, blocks, flags, counts, BLOCK: tl.constexpr
 ):  # fmt: skip
-    """Which pairs (camera, Gaussian) are visible: a footprint of `cutoff` standard deviations touches the image."""
-    c = tl.program_id(1)
-    g = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    """Which pairs (camera, Gaussian) are visible: the footprint, out to the cutoff, touches the image."""
+    b, c = tl.program_id(0), tl.program_id(1)
+    g = b * BLOCK + tl.arange(0, BLOCK)
     inside = g < n
     beyond, _, u, v, a0, a1, a2, b0, b1, b2 = _footprint(cameras + c * _WIDTH, means, quats, scales, g, inside, near)
     xx, xy, yy, det = variances(a0, a1, a2, b0, b1, b2, eps2d)
-    reach = tl.load(cutoff)
+    reach = tl.load(cameras + c * _WIDTH + _CUTOFF)
     rx, ry = reach * tl.sqrt(xx), reach * tl.sqrt(yy)
+    finite = flags + tl.num_programs(1).to(tl.int64) * n
     touches = inside & beyond & (tl.load(finite + g, mask=inside, other=0) > 0)
     touches &= (det > 0.0) & is_finite(det + _largest(xx, xy, yy) + u + v)
     touches &= (u + rx > -0.5) & (u - rx < width - 0.5) & (v + ry > -0.5) & (v - ry < height - 0.5)
-    tl.store(visible + c * n + g, touches.to(tl.int32), mask=inside)
+    tl.store(flags + c.to(tl.int64) * n + g, touches.to(tl.int8), mask=inside)
+    tl.store(counts + c * blocks + b, tl.sum(touches.to(tl.int64), 0))
+
+
+@triton.jit(do_not_specialize=["n", "blocks"])
+def number_rows(cameras, count, n, blocks, counts, numbers, BLOCK: tl.constexpr):
+    """Where the rows of each block begin, in place of its count; and `numbers`, but for the entries. One program."""
+    i = tl.arange(0, BLOCK)
+    finite = tl.zeros((BLOCK,), tl.int64)
+    first = 0
+    while first < blocks:
+        finite += tl.load(counts + count * blocks + first + i, mask=first + i < blocks, other=0)
+        first += BLOCK
+    tl.store(numbers + count, n - tl.sum(finite, 0))
+    begin = tl.sum(finite * 0, 0)
+    covered = begin + 1
+    c = 0
+    while c < count:
+        row = counts + c * blocks
+        first = 0
+        while first < blocks:
+            inside = first + i < blocks
+            added = tl.load(row + first + i, mask=inside, other=0)
+            tl.store(row + first + i, begin + tl.cumsum(added, 0) - added, mask=inside)
+            begin += tl.sum(added, 0)
+            first += BLOCK
+        tl.store(numbers + c, begin)
+        covered = tl.minimum(covered, tl.load(cameras + c * _WIDTH + _COVERED).to(tl.int64))
+        c += 1
+    tl.store(numbers + count + 1, covered)
+
+
+@triton.jit
+def _rows(flags, counts, b, c, g, n, inside, blocks):
+    """Which Gaussians of a block a camera sees, and their rows."""
+    visible = inside & (tl.load(flags + c.to(tl.int64) * n + g, mask=inside, other=0) > 0)
+    before = tl.load(counts + c * blocks + b)
+    return visible, before + tl.cumsum(visible.to(tl.int32), 0) - 1
 
 
 @triton.jit
@@ -182,21 +230,17 @@ def _direction(camera, mx, my, mz):
     return x / norm, y / norm, z / norm, 1.0 / norm / peak
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["n", "blocks"])
 def list_visible(
-    means, quats, scales, opacities, colors, cameras, running_counts, near, eps2d, n, views, means2d, factors, depths,
-    alphas, rgb, radii, camera_ids, ids,
+    means, quats, scales, opacities, colors, cameras, flags, counts, near, eps2d, n, blocks, views, means2d, factors,
+    depths, alphas, rgb, radii, camera_ids, ids,
     BANDS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Write what is visible to its row: the fields of `kgs.ProjectedGaussians`."""
-    c = tl.program_id(1)
+    b, c = tl.program_id(0), tl.program_id(1)
     camera = cameras + c * _WIDTH
-    g = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    pair = c * n + g
-    inside = g < n
-    end = tl.load(running_counts + pair, mask=inside, other=0)
-    visible = inside & (end > tl.load(running_counts + pair - 1, mask=inside & (pair > 0), other=0))
-    m = end - 1
+    g = b * BLOCK + tl.arange(0, BLOCK)
+    visible, m = _rows(flags, counts, b, c, g, n, g < n, blocks)
     _, z, u, v, a0, a1, a2, b0, b1, b2 = _footprint(camera, means, quats, scales, g, visible, near)
     xx, xy, yy, _ = variances(a0, a1, a2, b0, b1, b2, eps2d)
     tl.store(means2d + m * 2, u, mask=visible)
@@ -331,24 +375,23 @@ def _pose_totals(out, i: tl.constexpr, camera, moved, j, h, mx, my, mz, u0, u1, 
     _total(out + 4 * i + 3, moved + turned, visible)
 
 
-@triton.jit(do_not_specialize=["c"])
+@triton.jit(do_not_specialize=["c", "n", "blocks"])
 def footprint_gradients(
-    c, means, quats, scales, colors, cameras, running_counts, n, views, g_means2d, g_factors, g_depths, g_alphas, g_rgb,
-    d_means, d_quats, d_scales, d_opacities, d_colors, totals,
-    BANDS: tl.constexpr, WITH_COLORS: tl.constexpr, WITH_CAMERA: tl.constexpr, ADD: tl.constexpr, BLOCK: tl.constexpr,
+    c, means, quats, scales, colors, cameras, flags, counts, n, blocks, views, g_means2d, g_factors, g_depths, g_alphas,
+    g_rgb, d_means, d_quats, d_scales, d_opacities, d_colors, totals,
+    BANDS: tl.constexpr, WITH_DEPTHS: tl.constexpr, WITH_COLORS: tl.constexpr, WITH_CAMERA: tl.constexpr,
+    ADD: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """From gradients of what camera c sees to those of all Gaussians; `ADD`: added to those by the cameras before.
 
     With `WITH_CAMERA` also those of the camera, `totals` of each block of Gaussians: pose (3, 4), intrinsics (3, 3).
+    Without `WITH_DEPTHS` those of the depths are 0.
     """
     b = tl.program_id(0)
     camera = cameras + c * _WIDTH
     g = b * BLOCK + tl.arange(0, BLOCK)
-    pair = c * n + g
     inside = g < n
-    end = tl.load(running_counts + pair, mask=inside, other=0)
-    visible = inside & (end > tl.load(running_counts + pair - 1, mask=inside & (pair > 0), other=0))
-    m = end - 1
+    visible, m = _rows(flags, counts, b, c, g, n, inside, blocks)
     mx, my, mz, x, y, z = _camera_point(camera, means, g, visible)
     z = tl.where(visible, z, 1.0)
     inverse = 1.0 / z
@@ -373,7 +416,9 @@ def footprint_gradients(
     u0, u1, u2, v0, v1, v2 = _turned_back(t0, t1, t2, t3, t4, t5, r00, r01, r02, r10, r11, r12, r20, r21, r22)
     g_u = tl.load(g_means2d + m * 2, mask=visible, other=0.0)
     g_v = tl.load(g_means2d + m * 2 + 1, mask=visible, other=0.0)
-    g_depth = tl.load(g_depths + m, mask=visible, other=0.0)
+    g_depth = tl.zeros((BLOCK,), tl.float32)
+    if WITH_DEPTHS:
+        g_depth = tl.load(g_depths + m, mask=visible, other=0.0)
     gx, gy, gz, h00, h01, h02, h10, h11, h12 = _point_gradient(
         camera, x, y, z, u0, u1, u2, v0, v1, v2, g_u, g_v, g_depth
     )
