@@ -276,8 +276,7 @@ def test_normals_are_third_axes_towards_the_camera(exactly):
 
 
 @pytest.mark.parametrize("packed", [True, False])
-@pytest.mark.parametrize("shape", [(), (2,), (2, 3)])
-@pytest.mark.parametrize("sh_degree", [None, 1])
+@pytest.mark.parametrize(("shape", "sh_degree"), [((), None), ((2,), 1), ((2, 3), None)])
 def test_no_gaussians_and_none_seen(packed, shape, sh_degree):
     cameras = batch(*(random_camera(*SIZE, seed, torch.float32) for seed in range(2)))
     views = [x.expand(*shape, *x.shape) for x in (cameras.extrinsics, cameras.intrinsics[:, :3, :3])]
