@@ -20,11 +20,11 @@ _WIDER: tl.constexpr = tl.constexpr(1e-3)  # see `kgs.projection.cut_squared`
 @triton.jit(do_not_specialize=["n"])
 def fill_table(
     order, means2d, factors, opacities, depths, eps2d, n, table, counts, sorted_counts, begins,
-    COUNTED: tl.constexpr, BLOCK: tl.constexpr,
+    HAS_COUNTS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """What compositing reads of each Gaussian; see `.compositing_kernels`.
 
-    With `COUNTED` also their `counts` in depth order, and the 0 with which `begins` begins.
+    With `HAS_COUNTS` also their `counts` in depth order, and the 0 with which `begins` begins.
     """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = i < n
@@ -48,7 +48,7 @@ def fill_table(
     tl.store(row + 5, tl.where(wide, along, 0.0), mask=inside)
     tl.store(row + 6, tl.where(wide, 0.0, along), mask=inside)
     tl.store(row + 7, tl.load(depths + g, mask=inside, other=0.0), mask=inside)
-    if COUNTED:
+    if HAS_COUNTS:
         tl.store(sorted_counts + i, tl.load(counts + g, mask=inside, other=0), mask=inside)
         tl.store(begins + i, i.to(tl.int64), mask=i == 0)
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from kgs.backends.base import CompositingCall, CompositingInputs, Compositor, Images
 from kgs.backends.row_slices import check_fits
 
-from . import counted
+from . import entry_counts
 from .binning_kernels import count_entries, fill_entries, fill_table, list_tiles
 from .compositing_kernels import FEATURES, ROW, SIZE, K, composite_backward, composite_forward, sum_entries
 from .launch import blocks, launch
@@ -65,12 +65,12 @@ class GpuCompositor(Compositor):
         n = len(projected)
         self._table = depths.new_empty(n, 8)
         footprints = (means2d, factors, opacities)
-        known = counted.find(projected, options.alpha_threshold) if n else None
+        known = entry_counts.find(projected, options.alpha_threshold) if n else None
         counts, begins = self._room() if known else (self._order, self._order)  # or what nothing is written to
         arguments = (self._order, *footprints, depths, self._eps2d, n, self._table)
         sorting = (known.counts if known else counts, counts, begins)
-        launch(fill_table, (blocks(n, _BLOCK),), *arguments, *sorting, COUNTED=known is not None, BLOCK=_BLOCK)
-        log2_threshold = counted.log2_threshold(options.alpha_threshold)
+        launch(fill_table, (blocks(n, _BLOCK),), *arguments, *sorting, HAS_COUNTS=known is not None, BLOCK=_BLOCK)
+        log2_threshold = entry_counts.log2_threshold(options.alpha_threshold)
         ellipses = (self._order, *footprints, projected.camera_ids.contiguous(), self._eps2d, log2_threshold)
         self._ellipses = (*ellipses, *self._size, self._image_rows)
         whole = (_add_up(counts, begins), known.entries) if known else None

@@ -13,7 +13,7 @@ from kgs.backends.torch.projection import project as project_in_torch
 from kgs.camera import MARGIN, Cameras, whole_frame
 from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
 
-from . import counted
+from . import entry_counts
 from .binning_kernels import count_all_entries, sum_counts
 from .camera_kernels import WIDTH, describe_cameras
 from .compositing import LANES
@@ -57,7 +57,7 @@ def project(
         eps2d=options.eps2d,
     )
     if listed.entries is not None:
-        counted.remember(projected, options.alpha_threshold, *listed.entries)
+        entry_counts.remember(projected, options.alpha_threshold, *listed.entries)
     return projected
 
 
@@ -164,7 +164,7 @@ def _count_entries(
     among = blocks(len(means2d), LANES)
     counts = visible.flags.new_empty(len(means2d), dtype=torch.int32)
     sums = visible.numbers.new_empty(among)
-    threshold = counted.log2_threshold(options.alpha_threshold)
+    threshold = entry_counts.log2_threshold(options.alpha_threshold)
     ellipses = (means2d, factors, opacities, options.eps2d, threshold, *size, blocks(size[0], SIZE))
     launch(count_all_entries, (among,), visible.numbers, *ellipses, counts, sums, BLOCK=LANES, warps=1)
     launch(sum_counts, (1,), sums, among, visible.numbers[3:], BLOCK=_SUMS)

@@ -11,7 +11,7 @@ from kgs.types import ProjectedGaussians
 
 
 @dataclass(frozen=True)
-class Counted:
+class EntryCounts:
     """How many tiles each projected Gaussian of one camera reaches.
 
     They belong to the very tensors that were projected, as long as these are not changed in place. (What changes
@@ -32,7 +32,7 @@ class Counted:
     constants: tuple[object, ...]
 
 
-_counted = WeakTensorKeyDictionary()  # by means2d
+_known = WeakTensorKeyDictionary()  # by means2d
 
 
 def log2_threshold(alpha_threshold: float) -> float:
@@ -42,24 +42,24 @@ def log2_threshold(alpha_threshold: float) -> float:
 
 def remember(projected: ProjectedGaussians, alpha_threshold: float, counts: Tensor, entries: int) -> None:
     """Keep the counts while `projected.means2d` lives; not in inference mode, where no tensor knows its version."""
-    tensors = _counted_tensors(projected)
+    tensors = _source_tensors(projected)
     if any(x.is_inference() for x in tensors):
         return
     versions = tuple((weakref.ref(x), x._version) for x in tensors)
-    found = Counted(counts, entries, alpha_threshold, versions, _constants(projected))
-    _counted[projected.means2d] = found
+    found = EntryCounts(counts, entries, alpha_threshold, versions, _constants(projected))
+    _known[projected.means2d] = found
 
 
-def find(projected: ProjectedGaussians, alpha_threshold: float) -> Counted | None:
+def find(projected: ProjectedGaussians, alpha_threshold: float) -> EntryCounts | None:
     """The counts of these Gaussians, if they are known."""
-    found: Counted | None = _counted.get(projected.means2d)
+    found: EntryCounts | None = _known.get(projected.means2d)
     if found is None or found.alpha_threshold != alpha_threshold or found.constants != _constants(projected):
         return None
-    pairs = zip(found.tensors, _counted_tensors(projected), strict=True)
+    pairs = zip(found.tensors, _source_tensors(projected), strict=True)
     return found if all(of() is x and version == x._version for (of, version), x in pairs) else None
 
 
-def _counted_tensors(projected: ProjectedGaussians) -> tuple[Tensor, ...]:
+def _source_tensors(projected: ProjectedGaussians) -> tuple[Tensor, ...]:
     return projected.means2d, projected.factors, projected.opacities
 
 

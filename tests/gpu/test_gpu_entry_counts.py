@@ -8,7 +8,7 @@ import torch
 from projection_checks import wide_scene
 
 from kgs import RasterOptions, composite, project
-from kgs.backends.gpu import compositing, counted
+from kgs.backends.gpu import compositing, entry_counts
 
 THRESHOLD = RasterOptions().alpha_threshold
 
@@ -19,7 +19,7 @@ def projected(cameras=1):
 
 def test_the_counts_are_those_of_compositing_and_spare_it_a_wait(monkeypatch):
     found = projected()
-    known = counted.find(found, THRESHOLD)
+    known = entry_counts.find(found, THRESHOLD)
     assert len(known.counts) == len(found)
     assert known.entries == known.counts.sum() > 40
     waits, real = [], compositing.GpuCompositor._count
@@ -49,20 +49,20 @@ def test_the_counts_are_those_of_compositing_and_spare_it_a_wait(monkeypatch):
 )
 def test_what_is_changed_is_counted_anew(change):
     found = projected()
-    assert counted.find(found, THRESHOLD) is not None
-    assert counted.find(found, 0.0) is None
-    assert counted.find(change(found), THRESHOLD) is None
+    assert entry_counts.find(found, THRESHOLD) is not None
+    assert entry_counts.find(found, 0.0) is None
+    assert entry_counts.find(change(found), THRESHOLD) is None
 
 
 def test_they_are_known_with_gradients_not_of_several_cameras_nor_in_inference_mode_and_forgotten():
     gaussians, cameras = wide_scene(1, 40)
     leaf = replace(gaussians, opacities=gaussians.opacities.clone().requires_grad_())
     found = project(leaf, cameras, backend="triton")
-    assert counted.find(found, THRESHOLD) is not None
-    assert counted.find(projected(2), THRESHOLD) is None
+    assert entry_counts.find(found, THRESHOLD) is not None
+    assert entry_counts.find(projected(2), THRESHOLD) is None
     with torch.inference_mode():
-        assert counted.find(projected(), THRESHOLD) is None
-    before = len(counted._counted)
+        assert entry_counts.find(projected(), THRESHOLD) is None
+    before = len(entry_counts._known)
     del found
     gc.collect()
-    assert len(counted._counted) < before
+    assert len(entry_counts._known) < before
