@@ -2,8 +2,9 @@
 
 `projection_kernels`, `compositing_kernels` and `loss_kernels` have the kernels of a stage, and `projection`,
 `compositing` and `loss` bring them to torch; the other files of kernels are parts of these. `launch` calls them, and
-`entry_counts` tells compositing what projection has counted. Torch defines what is right; a kernel gives the same within the
-rounding of float32, and its formulas are explained in the torch code that it follows. `import kgs` does not import
+`entry_counts` tells compositing what projection has counted. Torch defines what is right; a kernel gives the same
+within the rounding of float32, and its formulas are explained in the torch code that it follows. `import kgs` does not
+import
 triton: a stage is imported when it is first used.
 
 With TRITON_INTERPRET=1 in the environment the kernels run on a CPU, slowly: so they are tested without a GPU.
