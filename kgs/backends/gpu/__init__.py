@@ -4,8 +4,7 @@
 `compositing` and `loss` bring them to torch; the other files of kernels are parts of these. `launch` calls them, and
 `entry_counts` tells compositing what projection has counted. Torch defines what is right; a kernel gives the same
 within the rounding of float32, and its formulas are explained in the torch code that it follows. `import kgs` does not
-import
-triton: a stage is imported when it is first used.
+import triton: a stage is imported when it is first used.
 
 With TRITON_INTERPRET=1 in the environment the kernels run on a CPU, slowly: so they are tested without a GPU.
 
