@@ -83,11 +83,11 @@ class SceneRequest:
         largest = min(DETAILS["high"].size, round(side * (self.downscale or 1.0)))
         return largest if largest > _LARGER * side else None
 
-    def shrink(self, source: SceneSource, scene: Scene) -> float:
+    def shrink(self, scene: Scene) -> float:
         """By what factor the photos of `scene` are smaller than the largest that its folder has."""
         factor = self.downscale or 1.0
         if self.photo_folder:
-            largest = load_scene(source, photos=False, hold_out=0).train.images.shape[-1]
+            largest = load_scene(scene.root, photos=False, hold_out=0).train.images.shape[-1]
             factor *= largest / scene.train.images.shape[-1]
         return factor
 

@@ -19,12 +19,12 @@ from torch import Tensor
 from kgs._support.progress import ProgressBar, silent
 from kgs.camera import move_camera
 from kgs.geometry import NEIGHBOURS, camera_centers, log_spacing, nearest_pixels, project_points, typical_depths
-from kgs.metrics.evaluate import clipped_psnr
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 
 from .fit import Fit
 from .pruning import psnr_per_view
+from .view_renders import ViewRenders
 
 KINDS = ("giants", "needles", "floaters")
 MAX_STRENGTH = 100.0
@@ -168,11 +168,11 @@ def clean(fit: Fit, strength: float = 1.0, bar: ProgressBar = silent) -> Cleaned
     views = fit.scene.train
     if views.images.is_meta:
         raise ValueError("fit: expected a scene with its photos, got one that was loaded without them")
-    cameras = [views.camera(i) for i in range(len(views))]
-    strays = find_strays(fit.model, strength, views.cameras, [fit.median_depth(camera) for camera in cameras])
-    before = psnr_per_view(fit)
+    renders = ViewRenders(views, fit.render_with_depth)
+    strays = find_strays(fit.model, strength, views.cameras, renders.median_depths)
+    before = [*renders.psnr_per_view]
     candidates = strays.any.nonzero()[:, 0]
-    order = candidates[_changes(fit, strays.any, bar).argsort()]
+    order = candidates[_changes(fit, strays.any, before, bar).argsort()]
     cleaned = fit
     after = before
     low = 0
@@ -257,12 +257,13 @@ def _near(means: Tensor, cameras: PinholeCamera, confirmed: Tensor, share: float
     return near
 
 
-def _changes(fit: Fit, rows: Tensor, bar: ProgressBar) -> Tensor:
+def _changes(fit: Fit, rows: Tensor, levels: Sequence[float], bar: ProgressBar) -> Tensor:
     """How much the image of a training view changes without each of the Gaussians at `rows`, bool `(N,)`; `(M,)`.
 
     The largest over the views of the squared change, summed over the pixels that count, over the mean squared error of
-    the view. An image is affine in the opacity of one Gaussian, so its change is the gradient by a factor of that
-    opacity; sums of the gradients times random signs, squared, are the sums of their squares in the mean.
+    the view, which its PSNR gives: `levels`. An image is affine in the opacity of one Gaussian, so its change is the
+    gradient by a factor of that opacity; sums of the gradients times random signs, squared, are the sums of their
+    squares in the mean.
     """
     views = fit.scene.train
     renderer = GaussianRenderer(options=fit.options, backend=fit.backend).eval()
@@ -282,6 +283,6 @@ def _changes(fit: Fit, rows: Tensor, bar: ProgressBar) -> Tensor:
             image.backward(signs)
             if factors.grad is not None:
                 squares += factors.grad.square()
-        error = 10.0 ** (-0.1 * clipped_psnr(fit.psnr(views.select([i]))))
+        error = 10.0 ** (-0.1 * levels[i])
         changes = torch.maximum(changes, squares / (_SIGNS * error))
     return changes[rows]

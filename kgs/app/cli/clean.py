@@ -81,7 +81,7 @@ def clean(
     fit = None
     if splat.is_dir():
         request, fit = load_fit(splat, device, backend, say)
-        downscale = request.shrink(SceneSource(fit.scene.root), fit.scene)
+        downscale = request.shrink(fit.scene)
         background = "white" if request.background == "white" else "black"
     elif source is not None:
         scene = load_cameras(source, downscale, photos=True, background=background)

@@ -55,7 +55,7 @@ def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, warps: int = 4, 
 
 
 def specialization(kernel: Any, arguments: tuple[Any, ...], rest: tuple[Any, ...]) -> tuple[Any, list[Any]]:
-    """A key that differs where Triton would compile a kernel anew, and the arguments with pointers for tensors.
+    """A key that differs where Triton would compile a kernel again, and the arguments with pointers for tensors.
 
     Triton compiles for the dtype of a tensor and whether its pointer is a multiple of 16, for integers of 32 and 64
     bits and, unless a kernel says `do_not_specialize`, for those that are 1 or a multiple of 16; on AMD's GPUs for
