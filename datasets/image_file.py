@@ -22,10 +22,12 @@ from PIL.Image import Exif
 from PIL.ImageFile import ImageFile as Opened
 
 from kgs._support.errors import DataError, listed
+from kgs._support.extras import check_opencv
 
 from . import folders
 from .color_profile import ADOBE_RGB, Colors, Profile, cmyk_to_rgb, colors_of, is_usable, to_srgb
 
+check_opencv()
 Image = NDArray[np.float32]
 _PLUGINS: dict[bytes, type[Opened]] = {
     b"\x89PNG\r\n\x1a\n": PngImagePlugin.PngImageFile,

@@ -15,6 +15,7 @@ from .types import check_tensor
 
 NEIGHBOURS = 3
 MIN_RELATIVE_SPACING = 1e-3
+_MAX_DISTANCES = 2**24  # at a time
 
 
 def camera_centers(extrinsics: Tensor) -> Tensor:
@@ -226,10 +227,21 @@ def log_spacing(points: Tensor) -> Tensor:
 
 def _mean_squared_distance(points: Tensor) -> Tensor:
     """The mean squared distance to the nearest three points, or to all others where they are fewer, `(N,)`."""
-    import cv2
-
-    data = points.float().cpu().numpy()  # the index refers to this array, it makes no copy
-    index = cv2.flann_Index(data, {"algorithm": 4})  # type: ignore[attr-defined]  # an exact k-d tree; not in the stubs
-    nearest, _ = index.knnSearch(data, min(NEIGHBOURS + 1, len(data)), params={})
-    ids = torch.from_numpy(nearest[:, 1:]).long().to(points.device)  # the first is the point itself or its double
+    ids = _nearest(points, min(NEIGHBOURS + 1, len(points)))[:, 1:]  # the first is the point itself or its double
     return (points[ids] - points[:, None, :]).square().sum(dim=-1).mean(dim=-1)
+
+
+def _nearest(points: Tensor, count: int) -> Tensor:
+    """The nearest points of each point in float32, in order, `(N, count)`; without OpenCV in quadratic time."""
+    data = points.float().cpu()
+    try:
+        import cv2
+    except ModuleNotFoundError:
+        blocks = data.split(max(1, _MAX_DISTANCES // len(data)))
+        exact = "donot_use_mm_for_euclid_dist"
+        found = [torch.cdist(x, data, compute_mode=exact).topk(count, largest=False).indices for x in blocks]
+        return torch.cat(found).to(points.device)
+    array = data.numpy()  # the index refers to this array, it makes no copy
+    index = cv2.flann_Index(array, {"algorithm": 4})  # type: ignore[attr-defined]  # an exact k-d tree; not in the stubs
+    nearest, _ = index.knnSearch(array, count, params={})
+    return torch.from_numpy(nearest).long().to(points.device)

@@ -22,7 +22,8 @@ def lazy_names(
             attributes, too.
 
     Returns:
-        `__getattr__`, which imports a name's module and returns the name, and `__dir__`.
+        `__getattr__`, which imports a name's module and returns the name, and `__dir__`. Where a package of an extra
+        is missing, the ModuleNotFoundError names the extra.
 
     Examples:
         >>> __getattr__, __dir__ = lazy_names("kgs", {"kgs.drop": ("DropGaussian", "drop_gaussian")})
@@ -31,9 +32,19 @@ def lazy_names(
     """
     modules = {name: module for module, names in homes.items() for name in names}
 
+    def load(module: str) -> "Any":
+        try:
+            return import_module(module)
+        except ModuleNotFoundError as error:
+            from .extras import missing
+
+            if (error.name or "kgs").partition(".")[0] == "kgs":
+                raise
+            raise ModuleNotFoundError(missing(error.name or ""), name=error.name) from error
+
     def __getattr__(name: str) -> "Any":
         if name in modules:
-            return getattr(import_module(modules[name]), name)
+            return getattr(load(modules[name]), name)
         if f"{package}.{name}" in homes:
             return import_module(f"{package}.{name}")
         raise AttributeError(f"module {package!r} has no attribute {name!r}")

@@ -9,7 +9,6 @@ from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-import cv2
 import kornia
 import torch
 
@@ -34,8 +33,12 @@ def check_packages(*packages: str) -> None:
 
 
 def versions() -> dict[str, str]:
-    """Versions of everything that affects a result; without numba or triton if they are not installed."""
-    result = {"kgs": __version__, "torch": torch.__version__, "kornia": kornia.__version__, "opencv": cv2.__version__}
+    """Versions of everything that affects a result; without OpenCV, numba or triton if they are not installed."""
+    result = {"kgs": __version__, "torch": torch.__version__, "kornia": kornia.__version__}
+    with contextlib.suppress(ModuleNotFoundError):
+        import cv2
+
+        result["opencv"] = cv2.__version__
     for package in ("numba", "triton"):
         with contextlib.suppress(PackageNotFoundError):
             result[package] = version(package)

@@ -21,6 +21,7 @@ from .timing import take_turns
 COUNTS = (10_000, 50_000)  # Gaussians whose training steps are timed
 # of each extra a package that only it brings, and what it is for
 _EXTRAS = {
+    "scenes": ("cv2", "photos, scenes and fits"),
     "fast": ("numba", "kernels for CPUs"),
     "app": ("matplotlib", "the other commands"),
     "sfm": ("pycolmap", "photos without cameras"),

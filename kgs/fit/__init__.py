@@ -1,6 +1,6 @@
 """Turns a scene into a splat, with one call or in a loop of your own.
 
-`initial_points` needs only the required packages; the others need the extra `app`.
+`initial_points` needs the extra `scenes`; the others need `app`.
 
 Examples:
     >>> from kgs.fit import FitConfig, Trainer, choose_points, decide, make_plan, prune

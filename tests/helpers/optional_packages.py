@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-OPTIONAL = ("distributed", "matplotlib", "numba", "pandas", "pycolmap", "scipy", "tyro")
+OPTIONAL = ("PIL", "cv2", "distributed", "matplotlib", "numba", "pandas", "pycolmap", "scipy", "trimesh", "tyro")
 
 
 def pytest_pycollect_makemodule(module_path: Path, parent: pytest.Collector) -> pytest.Module:

@@ -8,6 +8,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from kgs._support.errors import printable
+from kgs._support.extras import EXTRAS, missing
 
 from .interrupts import interrupt_as_usual
 
@@ -15,14 +16,6 @@ if TYPE_CHECKING:
     import torch
 
 _ALWAYS = ("torch", "kornia", "numpy", "cv2", "PIL")
-_EXTRAS = {
-    "numba": "fast",
-    "pi_heif": "heic",
-    "pycolmap": "sfm",
-    "distributed": "study",
-    "pandas": "study",
-    "scipy": "study",
-}
 
 
 def check_installed(*packages: str) -> None:
@@ -79,17 +72,13 @@ def explain_import_error(error: ImportError) -> str:
         raise error
     if package == "triton":  # torch brings it
         return str(error)
-    extra = _EXTRAS.get(package, "app")
     if isinstance(error, ModuleNotFoundError):
-        return (
-            f'{error.name} is missing: run pip install -e ".[{extra}]" in a clone of kgs, '
-            f'or pip install "kgs-splat[{extra}]" where an index has it'
-        )
+        return missing(error.name or package)
     from importlib.metadata import packages_distributions
 
     project = packages_distributions().get(package, [package])[0]
     reason = printable(str(error).strip().partition("\n")[0].rstrip("."))
     return (
         f"{package} is installed, but cannot be loaded ({reason}): run pip install --force-reinstall {project} "
-        f"(of the extra {extra})"
+        f"(of the extra {EXTRAS.get(package, 'app')})"
     )
