@@ -132,7 +132,7 @@ def test_a_fit_at_work_is_not_called_unfinished(folder, tmp_path, capsys):
     (tmp_path / UNFINISHED / CHECKPOINT).touch()
     with locked(tmp_path):
         assert run("fit", folder, "-o", tmp_path) == 2
-        assert "another fit is at work" in one_line(capsys)
+        assert "kgs is at work on the fit in this folder" in one_line(capsys)
     assert run("fit", folder, "-o", tmp_path) == 2
     assert "go on with it by --resume, or remove this folder" in one_line(capsys)
 

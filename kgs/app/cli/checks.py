@@ -44,13 +44,15 @@ def check_photos_of(source: SceneSource) -> None:
 def check_results(out: Path) -> None:
     """Raise a DataError unless this is the folder of the results of a fit."""
     from kgs._support.json_files import read_json
+    from kgs.app.files.locks import locked
     from kgs.app.files.publishing import UNFINISHED, complete
     from kgs.app.files.results_folder import has_fit
 
     complete(out)
     config = out / "config.json"
     if not config.exists() and has_fit(out / UNFINISHED):
-        raise DataError(out, "", "holds a fit that is not done: kgs fit --resume goes on with it")
+        with locked(out):  # or it is at work
+            raise DataError(out, "", "holds a fit that is not done: kgs fit --resume goes on with it")
     if not config.exists():
         raise DataError(config, "", "cannot be read: expected the folder of the results of kgs fit")
     read_json(config)
