@@ -1,4 +1,4 @@
-"""Errors beside wrong arguments: a bad file, and a fit whose numbers are no longer finite; and warnings."""
+"""Errors: a wrong argument, a bad file, and a fit whose numbers are no longer finite; and warnings."""
 
 import inspect
 import warnings
@@ -23,6 +23,16 @@ def warn(message: str, category: type[Warning] = UserWarning) -> None:
     names = [call.frame.f_globals.get("__name__", "") for call in inspect.stack(context=0)]
     outside = [not f"{name}.".startswith(("torch.", "kgs.")) for name in [*names, ""]]
     warnings.warn(message, category, stacklevel=outside.index(True) + 1)
+
+
+class ArgumentError(ValueError):
+    """An argument has another value than expected; the message begins with its name and a colon.
+
+    kgs raises it wherever it checks a value, and nothing else raises it. The class, not the text, so tells a mistake of
+    the caller from one in the code: torch, NumPy and Python raise plain ValueErrors. A value of a wrong type is a
+    TypeError, which no command line can bring about. `kgs.drop` and `kgs.reference`, which stand alone, raise plain
+    ValueErrors too; commands check what they pass to them.
+    """
 
 
 class DataError(Exception):

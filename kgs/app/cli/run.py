@@ -17,7 +17,7 @@ from functools import partial, wraps
 from pathlib import Path
 from typing import Any
 
-from kgs._support.errors import DataError, TrainingDiverged, printable
+from kgs._support.errors import ArgumentError, DataError, TrainingDiverged, printable
 from kgs.app.console import as_line, say
 from kgs.fit.config import FitConfig, Recipe
 
@@ -71,10 +71,8 @@ def exit_code(words: list[str]) -> int:
         message = explain_import_error(error)
     except DataError as error:
         message = str(DataError(error.path, flags.get(error.field, error.field), error.reason))
-    except ValueError as error:
+    except ArgumentError as error:
         argument, colon, reason = str(error).partition(":")
-        if re.match(r"\w+: ", str(error)) is None and " expected " not in str(error):
-            raise  # a mistake in kgs: messages for users begin with a name
         message = printable(flags.get(argument, argument) + colon + reason)
     except TrainingDiverged as error:
         message = printable(f"training diverged: {error}")
@@ -166,7 +164,7 @@ def _check_out(command: Callable[..., Any], name: str, words: list[str]) -> None
     if is_given or not is_needed or "--" in words or not words or words[0].startswith("-"):
         return
     if not words[0]:
-        raise ValueError(f"{next(iter(inspect.signature(command).parameters))}: expected a path, got ''")
+        raise ArgumentError(f"{next(iter(inspect.signature(command).parameters))}: expected a path, got ''")
     folder = f"{Path(words[0]).resolve().stem}-{name.rpartition(' ')[2]}"
     whole = as_line("kgs", *name.split(), *words, "-o", folder)
     raise SystemExit(f"-o: expected a folder for the results, for example {whole}")
@@ -189,7 +187,7 @@ def _parse(command: Callable[..., Any], name: str, words: list[str]) -> partial[
         config = bound.get("config")
         for option, value in [*bound.items(), ("init_file", config and config.init_file)]:
             if value is EMPTY:
-                raise ValueError(f"{option}: expected a path, got ''")
+                raise ArgumentError(f"{option}: expected a path, got ''")
         return partial(command, *arguments, **options)
 
     function: Callable[..., partial[Any]] = bind
