@@ -2,4 +2,5 @@
 
 from ._support.errors import ArgumentError as ArgumentError
 from ._support.errors import DataError as DataError
+from ._support.errors import PhotosRefused as PhotosRefused
 from ._support.errors import TrainingDiverged as TrainingDiverged

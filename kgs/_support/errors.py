@@ -55,5 +55,9 @@ class DataError(Exception):
         return f"{printable(where)}: {self.reason}"
 
 
+class PhotosRefused(DataError):
+    """The cameras of photos cannot be found, or cannot be trusted; the reason says what to photograph next."""
+
+
 class TrainingDiverged(RuntimeError):
     """A loss, gradient or parameter is no longer finite; raised before it can reach the optimiser's state."""
