@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kgs._support.errors import ArgumentError
+
 from .image_file import Image
 
 Maps = tuple[Image, Image]
@@ -114,7 +116,7 @@ def rectification(intrinsics: Intrinsics) -> tuple[Intrinsics, Maps | None]:
         return replace(intrinsics, distortion=()), None
     width, height = intrinsics.width, intrinsics.height
     if max(width, height) > _LONGEST_REMAPPED:
-        raise ValueError(f"distortion: can be undone up to {_LONGEST_REMAPPED} pixels of width or height, got more")
+        raise ArgumentError(f"distortion: can be undone up to {_LONGEST_REMAPPED} pixels of width or height, got more")
     zoom = _covering_zoom(intrinsics)
     pinhole = replace(intrinsics, fx=intrinsics.fx * zoom, fy=intrinsics.fy * zoom, distortion=(), fisheye=False)
     rectify = cv2.fisheye.initUndistortRectifyMap if intrinsics.fisheye else cv2.initUndistortRectifyMap
@@ -123,7 +125,7 @@ def rectification(intrinsics: Intrinsics) -> tuple[Intrinsics, Maps | None]:
     x, y = rectify(matrix, distortion, np.eye(3), pinhole.matrix(), (width, height), cv2.CV_32FC1)
     inside = x.min() >= -0.5 and y.min() >= -0.5 and x.max() <= width - 0.5 and y.max() <= height - 0.5
     if not inside or np.diff(x, axis=1).min(initial=1.0) <= 0 or np.diff(y, axis=0).min(initial=1.0) <= 0:
-        raise ValueError(f"distortion: {intrinsics.distortion} folds the image or maps it outside itself")
+        raise ArgumentError(f"distortion: {intrinsics.distortion} folds the image or maps it outside itself")
     return pinhole, (np.asarray(x, np.float32), np.asarray(y, np.float32))
 
 

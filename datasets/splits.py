@@ -5,6 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from kgs._support.errors import ArgumentError
+
 from .options import held_out_between_ends
 
 TEST_EVERY = 8
@@ -51,5 +53,5 @@ def select_evenly(count: int, train_views: int | None = None) -> list[int]:
         return list(range(count))
     if isinstance(train_views, bool) or not isinstance(train_views, int | np.integer) or not 1 <= train_views <= count:
         wanted = f"None or a whole number from 1 to {count}"
-        raise ValueError(f"train_views: expected {wanted}, got {train_views!r}")
+        raise ArgumentError(f"train_views: expected {wanted}, got {train_views!r}")
     return [int(i) for i in np.round(np.linspace(0, count - 1, train_views))]

@@ -6,7 +6,7 @@ The method: `drop` (the layer), `renderer`, `model`, `types`, `camera`, `project
 `gsplat` has gsplat's interface; `app` is the command.
 """
 
-from ._support.errors import DataError, TrainingDiverged
+from ._support.errors import ArgumentError, DataError, TrainingDiverged
 from ._support.lazy import TYPE_CHECKING, lazy_names
 from ._support.version import __version__ as __version__
 from ._support.wait_policy import wait_passively
@@ -28,7 +28,7 @@ __all__ = ["DropGaussian", "drop_gaussian", "GaussianRenderer", "rasterization",
 __all__ += ["Gaussians", "ProjectedGaussians", "RasterOptions", "Rendering", "PosedCamera", "pinhole_cameras"]
 __all__ += ["GaussianModel", "Densifier", "DensifyReport", "camera_extent", "save_ply", "load_ply"]
 __all__ += ["save_compressed_ply"]
-__all__ += ["DataError", "TrainingDiverged", "wait_passively"]
+__all__ += ["ArgumentError", "DataError", "TrainingDiverged", "wait_passively"]
 
 # so that the command `kgs` can answer before torch is loaded
 __getattr__, __dir__ = lazy_names(

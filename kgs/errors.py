@@ -1,4 +1,6 @@
-"""The errors of kgs beside wrong arguments: a bad file, and a fit whose numbers are no longer finite."""
+"""The errors of kgs: a wrong argument, a bad file, and a fit whose numbers are no longer finite."""
 
+from ._support.errors import ArgumentError as ArgumentError
 from ._support.errors import DataError as DataError
+from ._support.errors import PhotosRefused as PhotosRefused
 from ._support.errors import TrainingDiverged as TrainingDiverged

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kgs._support.errors import DataError, warn
+from kgs._support.errors import ArgumentError, DataError, warn
 from kgs._support.json_files import write_whole
 from kgs.model import MAX_SH_DEGREE, GaussianModel
 from kgs.types import SH_SIZES, check_kind
@@ -80,7 +80,7 @@ def save_ply(
     names = [*"xyz", "nx", "ny", "nz", *_properties_after_normals(3 * bands)]
     invalid = _invalid(table, names).any(axis=0)
     if invalid.any():
-        raise ValueError(
+        raise ArgumentError(
             f"model: expected values that are finite in float32, got NaN or infinity in {names[invalid.argmax()]}"
         )
     position = "float"
@@ -174,9 +174,9 @@ def as_vector(name: str, value: Tensor) -> NDArray[np.float64]:
     """A vector of three finite numbers as float64; a ValueError that names the argument if it is none."""
     vector: NDArray[np.float64] = torch.as_tensor(value, dtype=torch.float64, device="cpu").detach().numpy()
     if vector.shape != (3,):
-        raise ValueError(f"{name}: expected shape (3,), got {vector.shape}")
+        raise ArgumentError(f"{name}: expected shape (3,), got {vector.shape}")
     if not np.isfinite(vector).all():
-        raise ValueError(f"{name}: expected finite numbers, got {vector.tolist()}")
+        raise ArgumentError(f"{name}: expected finite numbers, got {vector.tolist()}")
     return vector
 
 
@@ -223,7 +223,7 @@ def _degree_of_file(sh_degree: int | None, model: GaussianModel) -> int:
         return minimum
     if not isinstance(sh_degree, int | np.integer) or not minimum <= sh_degree <= MAX_SH_DEGREE:
         expected = f"an integer from {minimum}, the model's, to {MAX_SH_DEGREE}"
-        raise ValueError(f"sh_degree: expected {expected}, got {sh_degree!r}")
+        raise ArgumentError(f"sh_degree: expected {expected}, got {sh_degree!r}")
     return int(sh_degree)
 
 

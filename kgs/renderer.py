@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from kgs._support.errors import ArgumentError
+
 from ._support.memory import empty
 from .backends import check_backend
 from .camera import Cameras
@@ -104,7 +106,7 @@ class GaussianRenderer(nn.Module):
                 backend that is named does not cover the call.
         """
         if isinstance(outputs, str) or not (outputs := tuple(outputs)) or set(outputs) - set(_OUTPUTS):
-            raise ValueError(f"outputs: expected some of {_OUTPUTS}, got {outputs!r}")
+            raise ArgumentError(f"outputs: expected some of {_OUTPUTS}, got {outputs!r}")
         check_kind("gaussians", gaussians, Gaussians)
         opacities = self.opacity_layer(gaussians.opacities)
         if opacities is not gaussians.opacities:
@@ -151,7 +153,7 @@ def blend(image: Tensor, transmittance: Tensor, background: Tensor | None, name:
     if shape in (full[1:2], full[:2]):
         background = background.reshape(*shape, 1, 1)
     elif shape not in (full[1:], full):
-        raise ValueError(f"{name}: expected shape {full[1:2]}, {full[:2]}, {full[1:]} or {full}, got {shape}")
+        raise ArgumentError(f"{name}: expected shape {full[1:2]}, {full[:2]}, {full[1:]} or {full}, got {shape}")
     if background.device.type != "cpu" or bool(background.isinf().any()):  # elsewhere the answer would be waited for
         # 0 where nothing shines through: 0 times an infinite background would be NaN
         background = torch.where(background.isinf() & (transmittance == 0), 0.0, background)

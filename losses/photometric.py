@@ -23,6 +23,7 @@ from kornia.filters import get_gaussian_kernel1d
 from kornia.losses import ssim_loss
 from torch import Tensor
 
+from kgs._support.errors import ArgumentError
 from kgs.backends import Backend, check_backend, choose
 
 WINDOW = 11  # pixels
@@ -102,15 +103,17 @@ def photometric_loss(
         raise TypeError(f"moments: expected TargetMoments, got {type(moments).__name__}")
     if moments is not None and not _belong_to(moments, image):
         given = tuple(moments.padded.shape)
-        raise ValueError(f"moments: expected those of a target like image, {tuple(image.shape)}, got {given} padded")
+        raise ArgumentError(f"moments: expected those of a target like image, {tuple(image.shape)}, got {given} padded")
     if isinstance(target, TargetMoments):
         target = target.padded[..., RADIUS:-RADIUS, RADIUS:-RADIUS].reshape(image.shape)
     _check_images(image, target)
     if not (math.isfinite(dssim_weight) and dssim_weight >= 0.0):
-        raise ValueError(f"dssim_weight: expected a finite number >= 0, got {dssim_weight}")
+        raise ArgumentError(f"dssim_weight: expected a finite number >= 0, got {dssim_weight}")
     outside = None if mask is None else _outside(mask, image)
     if dssim_weight != 0.0 and min(shape[-2:]) <= RADIUS:
-        raise ValueError(f"image: expected at least {RADIUS + 1} x {RADIUS + 1} pixels, got {shape[-2]} x {shape[-1]}")
+        raise ArgumentError(
+            f"image: expected at least {RADIUS + 1} x {RADIUS + 1} pixels, got {shape[-2]} x {shape[-1]}"
+        )
     fast = fast and not target.requires_grad
     chosen = choose(backend, "loss", image.device, lambda candidate: candidate.covers(image))
     if not chosen.has_loss or not fast or outside is not None or dssim_weight == 0.0 or min(shape[-2:]) < WINDOW:
@@ -133,7 +136,7 @@ def target_moments(target: Tensor, *, backend: str = "torch") -> TargetMoments:
     check_backend(backend)
     _check_images(target, target)
     if min(target.shape[-2:]) <= RADIUS:
-        raise ValueError(f"target: expected at least {RADIUS + 1} x {RADIUS + 1} pixels, got {tuple(target.shape)}")
+        raise ArgumentError(f"target: expected at least {RADIUS + 1} x {RADIUS + 1} pixels, got {tuple(target.shape)}")
     padded = F.pad(target.reshape(1, -1, *target.shape[-2:]), BORDER, mode="reflect")
     chosen = choose(backend, "loss", target.device, lambda candidate: candidate.covers(target))
     if chosen.has_moments and min(target.shape[-2:]) >= WINDOW:
@@ -265,12 +268,12 @@ def _outside(mask: Tensor, image: Tensor) -> Tensor:
     size = tuple(image.shape[-2:])
     shape = tuple(mask.shape) if isinstance(mask, Tensor) else type(mask).__name__
     if shape not in (size, (1, *size), (1, 1, *size), (images, 1, *size)):
-        raise ValueError(f"mask: expected shape {size}, {(1, *size)} or {(images, 1, *size)}, got {shape}")
+        raise ArgumentError(f"mask: expected shape {size}, {(1, *size)} or {(images, 1, *size)}, got {shape}")
     outside = mask == 0
     if not bool((outside | (mask == 1)).all()):
-        raise ValueError("mask: expected True and False, or 0 and 1; for other values write mask > 0.5")
+        raise ArgumentError("mask: expected True and False, or 0 and 1; for other values write mask > 0.5")
     if bool(outside.all()):
-        raise ValueError("mask: expected at least one pixel that counts, got none")
+        raise ArgumentError("mask: expected at least one pixel that counts, got none")
     return outside.expand(images, 1, *size)
 
 
@@ -320,6 +323,6 @@ def _check_images(image: Tensor, target: Tensor) -> None:
         expected = f"{image.dtype} on {image.device}"
         raise TypeError(f"target: expected {expected} as image, got {target.dtype} on {target.device}")
     if image.ndim != 4 or image.numel() == 0:
-        raise ValueError(f"image: expected shape (B, C, H, W) without a zero, got {tuple(image.shape)}")
+        raise ArgumentError(f"image: expected shape (B, C, H, W) without a zero, got {tuple(image.shape)}")
     if target.shape != image.shape:
-        raise ValueError(f"target: expected shape {tuple(image.shape)} as image, got {tuple(target.shape)}")
+        raise ArgumentError(f"target: expected shape {tuple(image.shape)} as image, got {tuple(target.shape)}")

@@ -15,6 +15,7 @@ from kornia.geometry.camera import PinholeCamera
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kgs._support.errors import ArgumentError
 from kgs.datasets.scene import Scene, Views, pinholes
 
 from . import room
@@ -50,7 +51,7 @@ def synthetic_scene(
         ("seed", seed, 0),
     ):
         if value < minimum:
-            raise ValueError(f"{name}: expected at least {minimum}, got {value}")
+            raise ArgumentError(f"{name}: expected at least {minimum}, got {value}")
     world = _make_world(seed)
     train_eyes, test_eyes = _patch_eyes(train_views, test_views, np.random.default_rng([seed, 1]))
     with torch.device("cpu"):  # whatever torch's default is
@@ -77,7 +78,7 @@ def views_beyond(out: float, count: int = 6, size: tuple[int, int] = (126, 168),
         ValueError: a number is out of range.
     """
     if not 0.0 < out < np.inf or count < 1:
-        raise ValueError(f"out, count: expected a number > 0 and at least one camera, got {out} and {count}")
+        raise ArgumentError(f"out, count: expected a number > 0 and at least one camera, got {out} and {count}")
     return _views(_make_world(seed), room.EYE + out * _ellipse(count) * room.PATCH, size, "beyond")
 
 
@@ -99,7 +100,7 @@ def synthetic_depths(cameras: PinholeCamera, seed: int = 0) -> Tensor:
     """
     sizes = set(zip(cameras.height.int().tolist(), cameras.width.int().tolist(), strict=True))
     if len(sizes) != 1:
-        raise ValueError(f"cameras: expected one image size, got {sorted(sizes)}")
+        raise ArgumentError(f"cameras: expected one image size, got {sorted(sizes)}")
     size = sizes.pop()
     triangles = _make_world(seed).triangles
     matrices = zip(cameras.intrinsics.double().cpu(), cameras.extrinsics.double().cpu(), strict=True)

@@ -14,6 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from kgs._support.errors import ArgumentError
+
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 MARGIN = 1e-6  # px by which bounding boxes are widened, so that rounding never loses a pixel on an edge
@@ -40,7 +42,7 @@ def raycast(triangles: Array, intrinsics: Array, extrinsics: Array, size: tuple[
         Kornia's: world-to-camera extrinsics, OpenCV axes (x right, y down, z forward), integer pixel centres.
     """
     if triangles.ndim != 3 or triangles.shape[1:] != (3, 3):
-        raise ValueError(f"triangles: expected shape (F, 3, 3), got {triangles.shape}")
+        raise ArgumentError(f"triangles: expected shape (F, 3, 3), got {triangles.shape}")
     faces = _project(triangles, intrinsics[:3, :3], extrinsics, size)
     depths = np.full(size, np.inf)
     nearest = np.full(size, -1, dtype=np.int64)

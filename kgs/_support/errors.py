@@ -1,4 +1,4 @@
-"""Errors beside wrong arguments: a bad file, and a fit whose numbers are no longer finite; and warnings."""
+"""Errors: a wrong argument, a bad file, and a fit whose numbers are no longer finite; and warnings."""
 
 import inspect
 import warnings
@@ -25,6 +25,16 @@ def warn(message: str, category: type[Warning] = UserWarning) -> None:
     warnings.warn(message, category, stacklevel=outside.index(True) + 1)
 
 
+class ArgumentError(ValueError):
+    """An argument has another value than expected; the message begins with its name and a colon.
+
+    kgs raises it wherever it checks a value, and nothing else raises it. The class, not the text, so tells a mistake of
+    the caller from one in the code: torch, NumPy and Python raise plain ValueErrors. A value of a wrong type is a
+    TypeError, which no command line can bring about. `kgs.drop` and `kgs.reference`, which stand alone, raise plain
+    ValueErrors too; commands check what they pass to them.
+    """
+
+
 class DataError(Exception):
     """A file or folder has other contents than expected.
 
@@ -43,6 +53,10 @@ class DataError(Exception):
     def __str__(self) -> str:
         where = f"{self.path}: {self.field}" if self.field else f"{self.path}"
         return f"{printable(where)}: {self.reason}"
+
+
+class PhotosRefused(DataError):
+    """The cameras of photos cannot be found, or cannot be trusted; the reason says what to photograph next."""
 
 
 class TrainingDiverged(RuntimeError):

@@ -87,7 +87,7 @@ def fit_folder(
         stages: names the stages as they begin.
 
     Raises:
-        DataError: the checkpoint is damaged or belongs to another fit, images are too small, another fit is at work in
+        DataError: the checkpoint is damaged or belongs to another fit, images are too small, kgs is at work on a fit in
             `out`, `out` cannot be written to or holds the files of a scene, what no fit wrote has the name of a result,
             or there is an unfinished fit and `resume` is False.
         TrainingDiverged: a number is not finite, or a scale explodes; the last checkpoint is kept.

@@ -1,12 +1,15 @@
 """Serves one page, and the newest splat for it, to browsers on this machine; from memory, without a file.
 
-It listens on the loopback interface alone. Any page that a browser shows can send requests there, so two checks keep
-others out: the Host header has to name this server (a domain that was made to resolve to 127.0.0.1 does not), and the
-splat is only for the page itself (Fetch Metadata). Without CORS headers no other page could read an answer.
+It listens on the loopback interface alone. Other accounts of this machine can reach its port, so all of it is below a
+path that is a secret, which only the console shows. Any page that a browser shows can send requests there, so two more
+checks keep others out: the Host header has to name this server (a domain that was made to resolve to 127.0.0.1 does
+not), and the splat is only for the page itself (Fetch Metadata). Without CORS headers no other page could read an
+answer.
 """
 
 import json
 import re
+import secrets
 import socketserver
 import time
 from collections.abc import Callable, Iterator
@@ -24,7 +27,7 @@ _IDLE = 10.0  # seconds after which a connection that does not go on is closed
 _GRACE = 1.0  # seconds that the end waits for a page that is open
 _RECENT = 3.0  # seconds since its last request for which a page counts as open
 _POLL = 0.1  # seconds that the end may wait for the thread of the server
-_SPLAT = re.compile(r"/splat\?after=(\d{1,9})", re.ASCII)
+_SPLAT = re.compile(r"splat\?after=(\d{1,9})", re.ASCII)
 _HEADERS = {
     "Cache-Control": "no-store",
     "Content-Security-Policy": "frame-ancestors 'none'",  # the rest is in the page
@@ -50,6 +53,7 @@ class LiveServer:
     Attributes:
         page: the HTML.
         port: on which it listens.
+        path: what every address begins with, a slash, 22 random characters and a slash.
         url: of the page.
         seconds: processor time that all answers took until now.
     """
@@ -67,7 +71,8 @@ class LiveServer:
         self._asked = float("-inf")  # time of the last request
         self._server = _Server((HOST, 0), lambda *request: _Handler(self, *request))
         self.port: int = self._server.server_address[1]
-        self.url = f"http://{HOST}:{self.port}/"
+        self.path = f"/{secrets.token_urlsafe(16)}/"
+        self.url = f"http://{HOST}:{self.port}{self.path}"
         self._thread = Thread(target=self._server.serve_forever, args=(_POLL,), daemon=True)
         self._thread.start()
 
@@ -178,13 +183,16 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Answer with the page or the splat."""
-        after = _SPLAT.fullmatch(self.path)
+        count = len(self._live.path)
+        is_known = secrets.compare_digest(self.path[:count].encode(), self._live.path.encode())  # in a constant time
+        rest = self.path[count:]
+        after = _SPLAT.fullmatch(rest)
         if self.headers["Host"] not in (f"{HOST}:{self._live.port}", f"localhost:{self._live.port}"):
             self.send_error(HTTPStatus.FORBIDDEN)
-        elif self.path == "/":
-            self._send("text/html; charset=utf-8", [self._live.page()])
-        elif after is None:
+        elif not is_known or not (rest == "" or after):
             self.send_error(HTTPStatus.NOT_FOUND)
+        elif after is None:
+            self._send("text/html; charset=utf-8", [self._live.page()])
         elif self.headers.get("Sec-Fetch-Site", "same-origin") not in ("same-origin", "none"):
             self.send_error(HTTPStatus.FORBIDDEN)
         else:

@@ -13,6 +13,8 @@ from collections.abc import Callable
 from torch import Tensor
 from torch import device as Device  # `import torch` would be taken for the folder of that name here
 
+from kgs._support.errors import ArgumentError
+
 from .base import Backend
 from .cpu import CpuBackend
 from .gpu import GpuBackend
@@ -32,7 +34,7 @@ def available() -> tuple[str, ...]:
 def check_backend(name: str) -> None:
     """Raise a ValueError for a backend that does not exist, a ModuleNotFoundError for one that is not installed."""
     if name not in available():
-        raise ValueError(f"backend: expected one of {available()}, got {name!r}")
+        raise ArgumentError(f"backend: expected one of {available()}, got {name!r}")
     for backend in BACKENDS:
         if backend.name == name and backend.package and not backend.is_installed():
             package, how = backend.package
@@ -53,7 +55,7 @@ def resolve(name: str, device: Device) -> str:
     devices = next(" and ".join(backend.devices or ()) for backend in BACKENDS if backend.name == name)
     others = "".join(f'; "{x.name}" runs on {device}, too' for x in BACKENDS if x.devices and x.runs_on(device))
     reason = f"which runs on {devices} alone{others}"
-    raise ValueError(f'backend: expected "auto" or "torch" on {device}, got "{name}", {reason}')
+    raise ArgumentError(f'backend: expected "auto" or "torch" on {device}, got "{name}", {reason}')
 
 
 def former_or_auto(name: str, device: Device) -> str:
@@ -79,7 +81,7 @@ def choose(name: str, stage: str, device: Device, covers: Callable[[Backend], bo
     for backend in BACKENDS:
         if name in ("auto", backend.name) and covers(backend) and _may_take(backend, name, device):
             return backend
-    raise ValueError(f'backend: {name!r} does not cover this call of {stage}, expected "auto" or "torch"')
+    raise ArgumentError(f'backend: {name!r} does not cover this call of {stage}, expected "auto" or "torch"')
 
 
 def takes_kernels(name: str, stage: str, like: Tensor) -> bool:

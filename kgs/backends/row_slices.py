@@ -1,5 +1,7 @@
 """Row slices: consecutive rows of tiles whose lists fit into `max_bytes` together."""
 
+from kgs._support.errors import ArgumentError
+
 
 def row_slices(row_bytes: list[int], max_bytes: int) -> list[tuple[int, int]]:
     """The first and last (exclusive) row of each slice, for rows of tiles that need so many bytes each.
@@ -25,4 +27,4 @@ def check_fits(row_bytes: int, max_bytes: int) -> None:
     if row_bytes > max_bytes:
         got = f"expected at least that, got {max_bytes} for it"
         ways = "raise max_bytes, or render fewer or smaller Gaussians"
-        raise ValueError(f"max_bytes: one row of tiles needs {row_bytes} bytes, {got}; {ways}")
+        raise ArgumentError(f"max_bytes: one row of tiles needs {row_bytes} bytes, {got}; {ways}")

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kgs._support.errors import ArgumentError
 from kgs._support.torch_threads import torch_on_all_threads
 
 
@@ -87,7 +88,7 @@ class Adam:
             negative = any(bool((loaded[name] < 0).any()) for name in ("step", "exp_avg_sq"))
             if negative or {name: tuple(value.shape) for name, value in loaded.items()} != shapes:
                 given = {name: tuple(value.shape) for name, value in loaded.items()}
-                raise ValueError(
+                raise ArgumentError(
                     f"optimizer: expected a step and two moments of shape {tuple(parameter.shape)} for "
                     f"{group['name']}, the second not negative, got shapes {given}"
                 )

@@ -6,6 +6,8 @@ Typed here; plain values only in files (metrics.json, checkpoints).
 from dataclasses import asdict, dataclass
 from typing import Any, Self
 
+from kgs._support.errors import ArgumentError
+
 
 @dataclass(frozen=True)
 class DegreeDecision:
@@ -99,7 +101,7 @@ class Decisions:
         try:
             return cls(**{name: _KINDS[name](**part) for name, part in values.items()})
         except (AttributeError, KeyError, TypeError) as error:
-            raise ValueError(f"decisions: expected those of a fit, got {error}") from error
+            raise ArgumentError(f"decisions: expected those of a fit, got {error}") from error
 
 
 _KINDS: dict[str, Any] = {

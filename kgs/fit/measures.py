@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from kgs._support.errors import DataError
+from kgs._support.errors import ArgumentError, DataError
 from kgs._support.machine import peak_rss_mb, versions
 from kgs.metrics.coverage import psnr_by_coverage
 from kgs.metrics.evaluate import MEASURES, evaluate_images, views_to_correct
@@ -52,9 +52,11 @@ def measure(fit: Fit, lpips: Lpips | None = None) -> dict[str, Any]:
     scene = fit.scene
     config = fit.settings
     if config is None:
-        raise ValueError("fit: expected a fit of kgs, which has settings, got a splat alone")
+        raise ArgumentError("fit: expected a fit of kgs, which has settings, got a splat alone")
     if not fit.history:
-        raise ValueError("fit: expected one that was just made, got one that was read from its folder: it has metrics")
+        raise ArgumentError(
+            "fit: expected one that was just made, got one that was read from its folder: it has metrics"
+        )
     init = used_init(config.init, fit.history["init"]["kind"])
     init_note = _INIT_NOTES.get(init, "initial points that were given")
     if config.init in ("dense", "sift") and init in ("sift", "random") and init != config.init:

@@ -14,6 +14,7 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.liegroup import Se3
 from torch import Tensor
 
+from kgs._support.errors import ArgumentError
 from kgs.datasets.scene import Scene
 from kgs.geometry import camera_centers, degrees_between
 
@@ -95,7 +96,7 @@ class MovingPoses:
         """Continue from a :meth:`state_dict`; a KeyError, TypeError or ValueError if an entry is missing or wrong."""
         extrinsics = state["extrinsics"]
         if extrinsics.shape != self.given.shape:
-            raise ValueError(f"poses: expected extrinsics {tuple(self.given.shape)}, got {tuple(extrinsics.shape)}")
+            raise ArgumentError(f"poses: expected extrinsics {tuple(self.given.shape)}, got {tuple(extrinsics.shape)}")
         self.extrinsics = extrinsics.double().clone()
         self._optimizer.load_state_dict(state["optimizer"])
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 from kornia.geometry.camera import PinholeCamera
 
+from kgs._support.errors import ArgumentError
 from kgs.datasets.scene import Scene, Views
 from kgs.model import GaussianModel
 
@@ -51,7 +52,7 @@ def scaled(fit: Fit, factor: float) -> Fit:
 
 def _check(factor: float) -> None:
     if not (math.isfinite(factor) and factor > 0):
-        raise ValueError(f"factor: expected a finite number above 0, got {factor}")
+        raise ArgumentError(f"factor: expected a finite number above 0, got {factor}")
 
 
 def _scaled_scene(scene: Scene, factor: float) -> Scene:

@@ -11,6 +11,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
+from kgs._support.errors import ArgumentError
 from kgs._support.json_files import is_number
 from kgs.datasets.scene import Scene, Views
 from kgs.densify import Densifier
@@ -171,7 +172,7 @@ class TrainState:
             model = GaussianModel(**copy.deepcopy(values["model"]))
             if model.max_sh_degree != (plan.config.sh_degree or 0) or model.means.dtype != torch.float32:
                 given = f"{model.means.dtype} and degree {model.max_sh_degree}"
-                raise ValueError(
+                raise ArgumentError(
                     f"model: expected float32 and harmonics of degree {plan.config.sh_degree}, got {given}"
                 )
             start = Start(*(copy.deepcopy(values[name]) for name in ("init", "extent", "near_plane", "depth")))
@@ -201,11 +202,11 @@ def state_errors() -> Iterator[None]:
     try:
         yield
     except KeyError as error:
-        raise ValueError(f"{error.args[0]}: expected this entry in the state, got none") from error
+        raise ArgumentError(f"{error.args[0]}: expected this entry in the state, got none") from error
     except torch.OutOfMemoryError:  # says nothing about the state
         raise
     except (AttributeError, RuntimeError, TypeError) as error:
-        raise ValueError(f"state: {error}") from error
+        raise ArgumentError(f"state: {error}") from error
 
 
 def fingerprint(scene: Scene) -> dict[str, Any]:
@@ -253,7 +254,7 @@ def check_saved(saved: dict[str, Any], scene: dict[str, Any], config: FitConfig,
         )
     elif planned != steps or done > planned:
         expected = f"{planned}, as the fit was begun with," if done < planned else f"at least the {done} that are done,"
-        raise ValueError(f"steps: expected {expected} got {steps}")
+        raise ArgumentError(f"steps: expected {expected} got {steps}")
     _compare_settings(saved["config"] | {"backend": saved["backend"]}, asked)
     for part in ("training", "test"):
         for what, sums in scene[part].items():
@@ -264,23 +265,25 @@ def check_saved(saved: dict[str, Any], scene: dict[str, Any], config: FitConfig,
                 given = (
                     f"changed ones: {changed:.200}" if changed else f"{len(sums or [])} instead of {len(before or [])}"
                 )
-                raise ValueError(f"{what} of the {part} views: expected those that the fit was begun with, got {given}")
+                raise ArgumentError(
+                    f"{what} of the {part} views: expected those that the fit was begun with, got {given}"
+                )
     if saved["scene"]["background"] != scene["background"]:
-        raise ValueError("background: expected the colour that the fit was begun with; this scene has a changed one")
+        raise ArgumentError("background: expected the colour that the fit was begun with; this scene has a changed one")
     if max(saved["stack"], default=0) >= len(scene["training"]["names"]):
-        raise ValueError(f"stack: expected views of the scene, got {saved['stack']!s:.80}")
+        raise ArgumentError(f"stack: expected views of the scene, got {saved['stack']!s:.80}")
     return notes
 
 
 def _compare_settings(saved: dict[str, Any], asked: dict[str, Any], path: str = "") -> None:
     for name, value in asked.items():
         if name not in saved:
-            raise ValueError(f"{path}{name}: expected a fit of this version of kgs, got one without this setting")
+            raise ArgumentError(f"{path}{name}: expected a fit of this version of kgs, got one without this setting")
         before = saved[name]
         if isinstance(value, dict) and isinstance(before, dict):
             _compare_settings(before, value, f"{path}{name}.")
         elif before != value:
-            raise ValueError(f"{path}{name}: expected {before!r}, as the fit was begun with, got {value!r}")
+            raise ArgumentError(f"{path}{name}: expected {before!r}, as the fit was begun with, got {value!r}")
 
 
 def check_plain(values: dict[str, Any], *names: str) -> None:
@@ -288,7 +291,7 @@ def check_plain(values: dict[str, Any], *names: str) -> None:
     for name in names:
         expected, is_right = PLAIN[name]
         if not is_right(values[name]):
-            raise ValueError(f"{name}: expected {expected}, got {str(values[name])[:80]!r}")
+            raise ArgumentError(f"{name}: expected {expected}, got {str(values[name])[:80]!r}")
 
 
 _is_count = partial(is_number, minimum=0, whole=True)

@@ -19,7 +19,7 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from kgs._support.errors import DataError, TrainingDiverged
+from kgs._support.errors import ArgumentError, DataError, TrainingDiverged
 from kgs._support.torch_threads import threads_beside
 from kgs.backends import BACKENDS, resolve
 from kgs.datasets.scene import Scene, Views
@@ -174,7 +174,7 @@ class Trainer:
         state = self.state
         schedule = self.plan.schedule
         if state.step >= schedule.steps:
-            raise ValueError(f"steps: expected a step of {schedule.steps} to be left, got none")
+            raise ArgumentError(f"steps: expected a step of {schedule.steps} to be left, got none")
         start = time.perf_counter()
         with threads_beside(self.plan.backend), torch.enable_grad():
             loss = self._optimize()

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from kgs._support.errors import warn
+from kgs._support.errors import ArgumentError, warn
 from kgs._support.progress import ProgressBar, silent
 from kgs.datasets.scene import Views
 from kgs.geometry import ViewGeometry
@@ -92,14 +92,14 @@ def initial_points(
     """
     check_kind("views", views, Views)
     if kind not in KINDS:
-        raise ValueError(f"kind: expected one of {list(KINDS)}, got {kind!r}")
+        raise ArgumentError(f"kind: expected one of {list(KINDS)}, got {kind!r}")
     if draw not in DRAWS:
-        raise ValueError(f"draw: expected one of {list(DRAWS)}, got {draw!r}")
+        raise ArgumentError(f"draw: expected one of {list(DRAWS)}, got {draw!r}")
     if count is not None and count < 1:
-        raise ValueError(f"count: expected at least 1, got {count}")
+        raise ArgumentError(f"count: expected at least 1, got {count}")
     if kind == "file":
         if file is None:
-            raise ValueError("file: expected a path for the kind 'file', got None")
+            raise ArgumentError("file: expected a path for the kind 'file', got None")
         return InitialPoints(*read_points(Path(file), origin), kind)
     geometry = ViewGeometry.of(views.cameras)
     tracked = certain_points(views, geometry, bar, backend)

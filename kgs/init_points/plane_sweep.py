@@ -11,6 +11,7 @@ import torch
 from kornia.color import rgb_to_grayscale
 from torch import Tensor
 
+from kgs._support.errors import ArgumentError
 from kgs._support.progress import ProgressBar, silent
 from kgs.datasets.scene import Views
 from kgs.geometry import ViewGeometry
@@ -50,7 +51,7 @@ def sweep_depths(
     If all other views are at the centre of a view, its depths are unknown and its scores -1.
     """
     if not 0 < near < far < math.inf:
-        raise ValueError(f"near, far: expected 0 < near < far, got {near} and {far}")
+        raise ArgumentError(f"near, far: expected 0 < near < far, got {near} and {far}")
     grey = rgb_to_grayscale(views.images.cpu().float())[:, 0]
     planes = plane_count(planes_wanted(views, near, far))
     typical = 2 / (1 / near + 1 / far)

@@ -19,6 +19,7 @@ import torch.nn.functional as F
 from kornia.metrics import psnr, ssim
 from torch import Tensor
 
+from kgs._support.errors import ArgumentError
 from kgs.datasets.scene import Scene, Views
 
 from .lpips import Lpips
@@ -75,9 +76,9 @@ def evaluate_images(
     for index, (name, image) in enumerate(zip(views.names, images, strict=True)):
         target = views.images[index : index + 1]
         if image.shape != target.shape:
-            raise ValueError(f"render: expected shape {tuple(target.shape)} for {name}, got {tuple(image.shape)}")
+            raise ArgumentError(f"render: expected shape {tuple(target.shape)} for {name}, got {tuple(image.shape)}")
         if not bool(image.isfinite().all()):
-            raise ValueError(f"render: expected finite values for {name}, got NaN or infinity")
+            raise ArgumentError(f"render: expected finite values for {name}, got NaN or infinity")
         shown, photo, share = views.compared(index, image)
         if correct_color is not None:
             valid = None if views.valid_mask is None else views.valid_mask[index]

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from kgs._support.errors import DataError
+from kgs._support.errors import ArgumentError, DataError
 
 from .weights import weight_files
 
@@ -83,9 +83,9 @@ class Lpips(nn.Module):
         ValueError for other shapes.
         """
         if image.ndim != 4 or image.shape[1] != 3 or min(image.shape[-2:]) < MIN_SIZE:
-            raise ValueError(f"image: expected shape (B, 3, H, W) with H, W >= {MIN_SIZE}, got {tuple(image.shape)}")
+            raise ArgumentError(f"image: expected shape (B, 3, H, W) with H, W >= {MIN_SIZE}, got {tuple(image.shape)}")
         if target.shape != image.shape:
-            raise ValueError(f"target: expected shape {tuple(image.shape)} as image, got {tuple(target.shape)}")
+            raise ArgumentError(f"target: expected shape {tuple(image.shape)} as image, got {tuple(target.shape)}")
         x = _network_input(image, rescale)
         y = _network_input(target, rescale)
         distance = image.new_zeros(len(image))

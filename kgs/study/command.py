@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from kgs._support.errors import DataError
+from kgs._support.errors import ArgumentError, DataError
 from kgs.app.cli.options import IfGiven, Out
 from kgs.app.cli.tools import check_installed, load_tools
 from kgs.fit.config import FitConfig
@@ -79,7 +79,7 @@ def study(
     reports = {"guard": ("guard.md", "guard.jsonl"), "beyond": ("beyond.md",)}
     check_free(out, "study", reports.get(preset, ("sparse.csv", "sparse.md", "index.html")))
     if table is not None and preset != "paper":
-        raise ValueError(f"table: expected the preset 'paper', which has the tables, got {preset!r}")
+        raise ArgumentError(f"table: expected the preset 'paper', which has the tables, got {preset!r}")
     FitConfig(steps=steps)
     if lpips_weights is not None:
         weight_files(lpips_weights)

@@ -16,6 +16,7 @@ from typing import Any
 from distributed import Client, KilledWorker, LocalCluster, Security, as_completed
 from distributed.core import rpc
 
+from kgs._support.errors import ArgumentError, DataError
 from kgs.app.files.locks import held
 
 from .running import Running
@@ -55,13 +56,13 @@ def run_grid(
         name: what a cell is called in these lines, and beside its steps while it runs.
 
     Raises:
-        ValueError: two cells are equal, `processes` is below 1, another run writes the file, or the scheduler does not
-            answer or was lost.
+        ArgumentError: two cells are equal, `processes` is below 1, or the scheduler does not answer or was lost.
+        DataError: another run writes the file, or a line of it is wrong.
     """
     if processes is not None and processes < 1:
-        raise ValueError(f"processes: expected at least 1, got {processes}")
+        raise ArgumentError(f"processes: expected at least 1, got {processes}")
     if len({_key(cell) for cell in cells}) < len(cells):
-        raise ValueError("cells: expected each one once, got two that are equal")
+        raise ArgumentError("cells: expected each one once, got two that are equal")
     with _alone(path):
         done = {_key(row["cell"]) for row in read_rows(path, repair=True)}
         missing = [cell for cell in cells if _key(cell) not in done]
@@ -117,7 +118,7 @@ def _do(
         cell = cell_of.pop(future)
         running.end(future.key)
         if future.status in ("cancelled", "lost"):
-            raise ValueError(_LOST)
+            raise ArgumentError(_LOST)
         error = future.exception()
         if isinstance(error, KilledWorker) and not alone:
             suspects.append(cell)
@@ -148,7 +149,7 @@ def _threads(client: Client) -> int:
     try:
         return sum(client.nthreads().values())
     except OSError:
-        raise ValueError(_LOST) from None
+        raise ArgumentError(_LOST) from None
 
 
 def _append(path: Path, row: dict[str, Any]) -> None:
@@ -194,7 +195,7 @@ def _check_scheduler(address: str) -> None:
     kind = answer.exception() or answer.result()
     if kind != "Scheduler":
         expected = "expected the address of a running Dask scheduler, as tcp://127.0.0.1:8786"
-        raise ValueError(f"scheduler: {expected}, got {address!r} ({kind!r})")
+        raise ArgumentError(f"scheduler: {expected}, got {address!r} ({kind!r})")
 
 
 async def _identify(address: str) -> str:
@@ -211,7 +212,7 @@ def read_rows(path: Path, *, repair: bool = False) -> list[dict[str, Any]]:
         repair: also remove a last line that was cut short from the file.
 
     Raises:
-        ValueError: another line is not JSON, or a line is not that of a cell.
+        DataError: another line is not JSON, or a line is not that of a cell.
     """
     lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
     rows = []
@@ -220,12 +221,11 @@ def read_rows(path: Path, *, repair: bool = False) -> list[dict[str, Any]]:
             row = json.loads(line)
         except ValueError as error:
             if number < len(lines):
-                raise ValueError(
-                    f"{path}: line {number}: expected JSON, got an error of its parser: {error}"
-                ) from error
+                reason = f"expected JSON, got an error of its parser: {error}"
+                raise DataError(path, f"line {number}", reason) from error
             break
         if not isinstance(row, dict) or not isinstance(row.get("cell"), dict):
-            raise ValueError(f"{path}: line {number}: expected a cell and its result, got {line[:60]!r}")
+            raise DataError(path, f"line {number}", f"expected a cell and its result, got {line[:60]!r}")
         rows.append(row)
     if repair and lines:
         with path.open("r+b") as file:
@@ -248,5 +248,5 @@ def _alone(path: Path) -> Iterator[None]:
     path.parent.mkdir(parents=True, exist_ok=True)
     with held(path) as ours:
         if not ours:
-            raise ValueError(f"{path}: expected no other run to write this file, but one does")
+            raise DataError(path, "", "expected no other run to write this file, but one does")
         yield

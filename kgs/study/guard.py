@@ -82,7 +82,7 @@ def write_guard(rows: Sequence[Row], out: Path, command: str, planned: int, stor
         planned: how many cells the preset has.
         stored: a guard.jsonl to compare with; where it lacks a cell, or is not there, the report has values alone.
 
-    Returns what guard.md holds; ValueError as of `read_rows`.
+    Returns what guard.md holds; DataError as of `read_rows`.
     """
     new = [_compact(row) for row in rows]
     old = finished_rows([row["cell"] for row in rows], stored)

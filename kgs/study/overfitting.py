@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kgs._support.errors import ArgumentError
 from kgs.camera import move_camera
 from kgs.datasets.scene import Views
 from kgs.fit.trainer import Trainer
@@ -27,7 +28,7 @@ def coadaptation(
     Source: "Quantifying and Alleviating Co-Adaptation in Sparse-View 3D Gaussian Splatting", arXiv 2508.12720.
     """
     if subsets < 2:
-        raise ValueError(f"subsets: expected at least 2, got {subsets}")
+        raise ArgumentError(f"subsets: expected at least 2, got {subsets}")
     renderer = GaussianRenderer(near_plane=near_plane)
     generator = torch.Generator().manual_seed(seed)
     gaussians = model()

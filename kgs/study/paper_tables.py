@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from kgs._support.errors import DataError
+from kgs._support.errors import ArgumentError, DataError
 
 from .grid import Cell
 from .published import PUBLISHED, SCENES_OF, benchmark_of
@@ -33,7 +33,7 @@ def cells_of_table(cells: Sequence[Cell], table: int, data: Path) -> list[Cell]:
         DataError: no cell is of the table, since `data` has none of its scenes, or they have too few photos.
     """
     if not 1 <= table <= len(TABLES):
-        raise ValueError(f"table: expected a number from 1 to {len(TABLES)}, got {table}")
+        raise ArgumentError(f"table: expected a number from 1 to {len(TABLES)}, got {table}")
     benchmark, name = TABLES[table - 1]
     printed = PUBLISHED[(PUBLISHED.benchmark == benchmark) & (PUBLISHED.table == name)]
     settings = {*zip(printed.views, printed.method, strict=True)}

@@ -6,7 +6,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from kgs._support.errors import DataError
+from kgs._support.errors import ArgumentError, DataError
 from kgs.bench.scenes import SYNTHETIC, check_scenes
 from kgs.datasets import load_scene
 from kgs.fit.config import FitConfig
@@ -74,7 +74,7 @@ def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
         data: the folder of the scenes: `llff/fern` and so on; DataError: None, or a scene is missing.
     """
     if preset not in _FITS:
-        raise ValueError(f"preset: expected one of {list(_FITS)}, got {preset!r}")
+        raise ArgumentError(f"preset: expected one of {list(_FITS)}, got {preset!r}")
     if preset == "quick":
         scene = [(SYNTHETIC, 3)]
         blocks: list[Block] = [
@@ -134,11 +134,11 @@ def select(
         there = list(dict.fromkeys(cell[key] for cell in cells))
         for value in values:
             if value not in there:
-                raise ValueError(f"{name}: expected some of {there}, got {value!r}")
+                raise ArgumentError(f"{name}: expected some of {there}, got {value!r}")
         chosen = [cell for cell in chosen if cell[key] in values]
     if not chosen:
         given = {name: list(values) for name, values in wanted.items() if values is not None}
-        raise ValueError(f"cells: expected one with {given}, got none; --list shows all of them")
+        raise ArgumentError(f"cells: expected one with {given}, got none; --list shows all of them")
     return chosen
 
 

@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -165,10 +166,12 @@ def test_what_folders_and_options_show_is_told_before_torch_is_loaded(tmp_path):
     code = WITHOUT_TORCH.replace("import kgs.app.cli\nkgs.app.cli.main()", imports + RUN_ALL)
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, cwd=tmp_path, input=json.dumps(MISTAKES), capture_output=True, text=True, timeout=60)
-    texts = done.stderr.split("exit 2\n")
-    assert len(texts) == len(MISTAKES) + 1, done.stderr
-    for (words, said, _), text in zip(MISTAKES, texts[:-1], strict=True):
+    *texts, _ = re.split(r"exit (\d+)\n", done.stderr)
+    assert len(texts) == 2 * len(MISTAKES), done.stderr
+    for (words, said, _), text, code in zip(MISTAKES, texts[::2], texts[1::2], strict=True):
         assert said in text, words
+        is_file = re.match(r"kgs: (missing|empty|two|poses|photos|heic)\b", text)
+        assert code == ("1" if "is missing: run" in text else "3" if is_file else "2"), words
         assert text.startswith(("kgs: ", "╭")), words  # a line of ours, or a box of tyro's
         assert text.count("\n") == 1 or text[0] == "╭", words
     assert sorted(tmp_path.rglob("*")) == before

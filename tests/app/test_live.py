@@ -112,7 +112,7 @@ def test_it_shows_the_splat_as_it_grows_and_changes_no_bit_of_it(scene: Any, tmp
         assert torch.equal(value, states[1]["model"][name]), name
 
     at = fit.lines.index("2 of 4: fit")
-    assert re.search(r"open http://127\.0\.0\.1:\d+/ in a browser", fit.lines[at + 1])
+    assert re.search(r"open http://127\.0\.0\.1:\d+/[\w-]{22}/ in a browser", fit.lines[at + 1])
     assert fit.watcher
     read = fit.watcher.read
     assert fit.watcher.texts[0] == "step 0 of 8, 150 Gaussians"
@@ -195,7 +195,7 @@ def test_a_fit_goes_on_where_there_is_no_port(scene: Any, tmp_path: Path, monkey
 
 def test_the_command_names_the_address(folder: Path, tmp_path: Path, capsys: Any, monkeypatch: Any) -> None:
     assert run("fit", folder, "-o", tmp_path, "--init", "random", "--init-points", 50, "--steps", 3, "--live") == 0
-    assert len(re.findall(r"^open http://127\.0\.0\.1:\d+/ in a browser", capsys.readouterr().out, re.M)) == 1
+    assert len(re.findall(r"^open http://127\.0\.0\.1:\d+/[\w-]{22}/ in a browser", capsys.readouterr().out, re.M)) == 1
 
 
 DRAWN = "viewer.draw(), document.querySelector('canvas').toDataURL()"

@@ -19,7 +19,7 @@ from kgs.app.page.data import Packed
 SPLAT = Packed({"count": 2, "degree": 0, "columns": ["x"]}, b"\0\n345678")
 OTHER_HOSTS = ("evil.example:{}", "127.0.0.1", "localhost", "127.0.0.1:1", "127.0.0.1:{}.evil.example")
 OTHER_PATHS = ("/index.html", "/splat", "/splat?after=", "/splat?after=-1", "/splat?after=1x", "/splat?after=1&b=2")
-OTHER_PATHS += ("/../../../../etc/passwd", "/%2e%2e/etc/passwd", "/?", "/favicon.ico", "http://127.0.0.1/", "*")
+OTHER_PATHS += ("/../../../../etc/passwd", "/%2e%2e/etc/passwd", "/?", "/favicon.ico", "/http://127.0.0.1/", "//")
 
 
 @pytest.fixture
@@ -32,9 +32,13 @@ def server(monkeypatch: Any) -> Iterator[LiveServer]:
         server.close("over")
 
 
-def ask(server: LiveServer, words: str = "GET /", *headers: str, host: str | None = None) -> tuple[int, str, bytes]:
-    """Code, head and body of the answer to a request, written by hand."""
-    lines = [f"{words} HTTP/1.1", f"Host: {host or f'127.0.0.1:{server.port}'}", *headers, "", ""]
+def ask(
+    server: LiveServer, words: str = "GET /", *headers: str, host: str | None = None, path: str | None = None
+) -> tuple[int, str, bytes]:
+    """Code, head and body of the answer to a request, written by hand; its path is below the secret one."""
+    method, below = words.split(" /", 1)
+    whole = (server.path if path is None else path) + below
+    lines = [f"{method} {whole} HTTP/1.1", f"Host: {host or f'127.0.0.1:{server.port}'}", *headers, "", ""]
     with socket.create_connection(("127.0.0.1", server.port), timeout=20) as connection:
         connection.sendall("\r\n".join(lines).encode())
         answer = b"".join(iter(lambda: connection.recv(65536), b""))
@@ -108,6 +112,20 @@ def test_other_hosts_paths_and_methods_are_refused(
     assert "content-type: text/plain" in head
 
 
+def test_nothing_is_there_without_the_secret_path(server: LiveServer) -> None:
+    """Other accounts of the machine can reach the port."""
+    secret = server.path.strip("/")
+    assert server.url == f"http://127.0.0.1:{server.port}/{secret}/"
+    assert len(secret) >= 22  # 128 bits
+    others = ("/", "//", f"/{secret}", f"/{secret[:-1]}/", f"/{secret}x/", f"/{secret.swapcase()}/", "*", "/\u00ff/")
+    for path in others:
+        for below in ("", "splat?after=0"):
+            assert ask(server, f"GET /{below}", path=path)[::2] == (404, b"Not Found"), path
+    other = LiveServer(lambda: b"another fit")
+    other.close("over")
+    assert other.path != server.path
+
+
 def test_a_request_without_a_host_is_refused(server: LiveServer) -> None:
     with socket.create_connection(("127.0.0.1", server.port), timeout=20) as connection:
         connection.sendall(b"GET / HTTP/1.0\r\n\r\n")
@@ -146,7 +164,7 @@ def test_it_says_nothing(server: LiveServer, capfd: Any) -> None:
         connection.sendall(b"\0\xff nonsense\r\n\r\n")
         assert connection.recv(100)
     client = socket.create_connection(("127.0.0.1", server.port), timeout=5)
-    client.sendall(f"GET /splat?after=1 HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\n\r\n".encode())
+    client.sendall(f"GET {server.path}splat?after=1 HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\n\r\n".encode())
     while not server.is_awaited:
         time.sleep(0.01)
     client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")

@@ -436,6 +436,6 @@ def test_no_command_replaces_a_file_of_the_user_or_of_another_command(
     else:
         write(tmp_path, {name: "mine"})
     given = [word.format(scene=folder, fit=fitted, out=tmp_path) for word in words.split()]
-    assert run(*given) == 2
+    assert run(*given) == 3
     assert f"holds {name}, which this command did not write" in one_line(capsys)
     assert contents(tmp_path) == {name: "mine"}

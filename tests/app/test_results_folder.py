@@ -87,7 +87,7 @@ def seed_of(out: Path) -> int:
 
 
 def test_a_second_fit_in_the_folder_is_refused(scene: Any, tmp_path: Path) -> None:
-    with locked(tmp_path), pytest.raises(DataError, match="another fit is at work in this folder"):
+    with locked(tmp_path), pytest.raises(DataError, match="at work on the fit in this folder"):
         fit(scene, CONFIG, tmp_path)
     fit(scene, CONFIG, tmp_path)
 
@@ -97,7 +97,7 @@ def test_a_killed_process_leaves_no_lock(tmp_path: Path) -> None:
     code += "with locks.locked(pathlib.Path(sys.argv[1])):\n    print('locked', flush=True)\n    time.sleep(60)"
     with subprocess.Popen([sys.executable, "-c", code, tmp_path], stdout=subprocess.PIPE) as process:
         assert process.stdout.readline()
-        with pytest.raises(DataError, match="another fit"), locked(tmp_path):
+        with pytest.raises(DataError, match="at work"), locked(tmp_path):
             pass
         process.kill()
     with locked(tmp_path):
@@ -278,23 +278,31 @@ def test_eval_does_not_pass_off_the_checkpoint_of_another_step(scene: Any, done:
         load_fit(done)
 
 
-def test_eval_does_not_write_over_a_fit_that_came_meanwhile(scene: Any, done: Path, monkeypatch: Any) -> None:
+def test_eval_and_a_fit_keep_out_of_each_others_way(scene: Any, done: Path, monkeypatch: Any) -> None:
+    """A second one is refused before it measures, and no fit takes the place of the one that is being measured."""
     plain = measures.measure_again
+    refused = 0
 
     def meanwhile(*arguments: Any) -> Any:
-        fit(scene, OTHER, done)
+        nonlocal refused
+        for again in (lambda: fit(scene, OTHER, done), lambda: evaluate(done)):
+            with pytest.raises(DataError, match="at work on the fit in this folder"):
+                again()
+            refused += 1
         return plain(*arguments)
 
     monkeypatch.setattr(measures, "measure_again", meanwhile)
-    with pytest.raises(DataError, match="a new fit took the place"):
-        evaluate(done)
-    assert seed_of(done) == 1
+    evaluate(done)
+    assert refused == 2
+    assert seed_of(done) == 0
 
 
 def test_eval_says_how_to_go_on_with_a_fit_that_was_killed(tmp_path: Path) -> None:
     (tmp_path / UNFINISHED).mkdir()
     (tmp_path / UNFINISHED / CHECKPOINT).touch()
     with pytest.raises(DataError, match="kgs fit --resume"):
+        evaluate(tmp_path)
+    with locked(tmp_path), pytest.raises(DataError, match="at work on the fit"):
         evaluate(tmp_path)
 
 

@@ -23,11 +23,11 @@ from photo_folders import (
     write_planes,
 )
 
-from kgs._support.errors import DataError
 from kgs.app.sfm import map as mapping
 from kgs.app.sfm import pose_photos
 from kgs.app.sfm.write import leveling, write_model
 from kgs.datasets import load_scene
+from kgs.errors import PhotosRefused
 from kgs.geometry import degrees_between
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -331,7 +331,7 @@ def test_real_photos_against_given_poses(tmp_path, kgs_data, name, views, rotati
     for view in given.names:
         shutil.copy(folder / Path(view).name, tmp_path / "photos")
     if rotation is None:
-        with pytest.raises(DataError, match="no cameras that can be trusted"):
+        with pytest.raises(PhotosRefused, match="no cameras that can be trusted"):
             pose_photos(tmp_path / "photos", tmp_path / "out")
         return
     pose_photos(tmp_path / "photos", tmp_path / "out")

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from solved_cameras import solved
 
-from kgs._support.errors import DataError
 from kgs.app.sfm import map as mapping
 from kgs.app.sfm.gates import (
     disagreement,
@@ -20,6 +19,7 @@ from kgs.app.sfm.gates import (
     why_no_cameras,
 )
 from kgs.app.sfm.map import PairGeometry
+from kgs.errors import PhotosRefused
 
 NAMES = ["a", "b", "c"]
 PAIRS = {("a", "b"): 200, ("a", "c"): 40, ("b", "c"): 90}
@@ -58,21 +58,21 @@ def test_disagreement_is_the_angle_between_relative_rotations(angle):
 def test_two_solvers_have_to_agree(tmp_path):
     first, second = cameras(), cameras(turn=1.9, points=(99, 99, 99))
     assert judge(tmp_path, [first, second], NAMES, 1000, PAIRS) == (1, pytest.approx(1.9))  # it sees more points
-    with pytest.raises(DataError, match="disagree about b and c"):
+    with pytest.raises(PhotosRefused, match="disagree about b and c"):
         judge(tmp_path, [first, cameras(turn=2.1)], NAMES, 1000, PAIRS)
     for other in (None, cameras(missing=("c",))):
-        with pytest.raises(DataError, match=r"only one could place .*c, so that nothing confirms it"):
+        with pytest.raises(PhotosRefused, match=r"only one could place .*c, so that nothing confirms it"):
             judge(tmp_path, [first, other], NAMES, 1000, PAIRS)
     few = cameras(points=(90, 20, 90))  # enough to confirm the other
     assert judge(tmp_path, [few, first], NAMES, 1000, PAIRS)[0] == 1
-    with pytest.raises(DataError, match="places between b and c"):  # the weakest link of the strongest tree
+    with pytest.raises(PhotosRefused, match="places between b and c"):  # the weakest link of the strongest tree
         judge(tmp_path, [few, few], NAMES, 1000, PAIRS)
 
 
 def test_the_photos_or_their_exif_have_to_tell_the_focal_length(tmp_path):
     first, second, given = cameras(rise=0.004), cameras(rise=0.009, points=(99, 99, 99)), cameras(rise=np.inf)
     for unsure in (first, cameras(rise=-1e-9), cameras(rise=np.nan)):
-        with pytest.raises(DataError, match=r"grow by 0\.9%, less than 3%.*3 to 20 degrees apart"):
+        with pytest.raises(PhotosRefused, match=r"grow by 0\.9%, less than 3%.*3 to 20 degrees apart"):
             judge(tmp_path, [unsure, second], NAMES, 1000, PAIRS)
     assert judge(tmp_path, [given, given], NAMES, 1000, PAIRS)[0] == 0
     more = given._replace(points=dict.fromkeys(NAMES, 99))  # of the same focal lengths
@@ -87,9 +87,9 @@ def test_two_solvers_have_to_agree_on_the_focal_length(tmp_path):
     near, far = cameras(focal=700), cameras(focal=690)
     assert judge(tmp_path, [cameras(), near], NAMES, 1000, PAIRS)[0] == 0
     for found in ([cameras(), far], [far, cameras()]):
-        with pytest.raises(DataError, match=r"differ by a factor of 1\.16, more than 1\.15.*3 to 20 degrees apart"):
+        with pytest.raises(PhotosRefused, match=r"differ by a factor of 1\.16, more than 1\.15.*3 to 20 degrees apart"):
             judge(tmp_path, found, NAMES, 1000, PAIRS)
-    with pytest.raises(DataError, match="disagree about .*3 degrees.*places between"):  # the graver one first
+    with pytest.raises(PhotosRefused, match="disagree about .*3 degrees.*places between"):  # the graver one first
         judge(tmp_path, [cameras(), cameras(focal=690, turn=3.0)], NAMES, 1000, PAIRS)
 
 
@@ -153,7 +153,7 @@ def test_what_is_said_of_a_camera_that_went_forward(tmp_path):
         assert not is_forward(pairs)
     alone, turned = [cameras(), None], [cameras(), cameras(turn=3.0)]
     for found in ([cameras(focal=3001)] * 2, [cameras(rise=0.0)] * 2, turned, alone):
-        with pytest.raises(DataError, match="step sideways, not forward") as caught:
+        with pytest.raises(PhotosRefused, match="step sideways, not forward") as caught:
             judge(tmp_path, found, NAMES, 1000, PAIRS, forward=True)
         assert "places between" not in str(caught.value)
         assert "Matches of each pair" in str(caught.value)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from kgs import DataError, Gaussians, backends
+from kgs import ArgumentError, DataError, Gaussians, backends
 from kgs.bench import check
 from kgs.bench.scenes import check_scenes, gradients
 from kgs.bench.speed import speed
@@ -69,8 +69,8 @@ def test_gradients_are_taken_on_the_device_of_the_image():
 @pytest.mark.parametrize(
     ("name", "kind", "call"),
     [
-        ("device", ValueError, lambda _: check.check(device="nothing")),
-        ("device", ValueError, lambda folder: speed(out=folder / "new", device="gpu9")),
+        ("device", ArgumentError, lambda _: check.check(device="nothing")),
+        ("device", ArgumentError, lambda folder: speed(out=folder / "new", device="gpu9")),
         ("{}: llff/fern", DataError, lambda folder: check_scenes(folder, ["llff/fern"])),
     ],
 )

@@ -17,9 +17,9 @@ ROOT = Path(__file__).parents[2]
 # to remove or rename a name, edit this list and the changelog in the same change
 INVENTORY = {
     "kgs": """
-        DataError Densifier DensifyReport DropGaussian GaussianModel GaussianRenderer Gaussians PosedCamera
-        ProjectedGaussians Rendering RasterOptions TrainingDiverged camera_extent pinhole_cameras composite
-        drop_gaussian load_ply project rasterization save_compressed_ply save_ply wait_passively
+        ArgumentError DataError Densifier DensifyReport DropGaussian GaussianModel GaussianRenderer Gaussians
+        PosedCamera ProjectedGaussians Rendering RasterOptions TrainingDiverged camera_extent pinhole_cameras
+        composite drop_gaussian load_ply project rasterization save_compressed_ply save_ply wait_passively
     """,
     "kgs.losses": "TargetMoments photometric_loss target_moments",
     "kgs.datasets": "Scene Views load_scene synthetic_scene",

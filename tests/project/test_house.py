@@ -160,6 +160,20 @@ print(kgs._support.machine.peak_rss_mb())
     assert memory == "0"  # Windows has no `resource`: the memory of a fit is not known where nothing tells it
 
 
+# -- errors --------------------------------------------------------------------------------------------------------
+
+# two import nothing of kgs; the readers turn their ValueErrors into DataErrors
+PLAIN = {"kgs.drop", "kgs.reference"}
+PLAIN |= {"kgs._support.json_files", "kgs.datasets.color_profile", "kgs.datasets.image_file", "kgs.fit.checkpoint"}
+
+
+def test_a_wrong_value_is_an_argument_error():
+    """Of a plain ValueError the command shows the traceback: it comes from torch or NumPy, and is no user's mistake."""
+    raised = [(name, node.exc) for name in SOURCES for node in nodes(name) if isinstance(node, ast.Raise)]
+    plain = {name for name, error in raised if error is not None and ast.unparse(error).startswith("ValueError")}
+    assert plain <= PLAIN
+
+
 # -- names and docstrings ------------------------------------------------------------------------------------------
 
 

@@ -51,7 +51,7 @@ def test_a_package_that_is_missing_is_named_before_any_work(package, tmp_path, m
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(SystemExit) as error:
         main(["study", "-o", str(tmp_path / "out")])
-    assert error.value.code == 2
+    assert error.value.code == 1
     said = capsys.readouterr().err
     assert re.match(rf"kgs: {package}\S* is missing: ", said)
     assert f"[{'app' if package in ('matplotlib', 'jinja2') else 'study'}]" in said

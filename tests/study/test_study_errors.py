@@ -6,7 +6,7 @@ import pytest
 import torch
 from study_rows import made_up, tiny_cell
 
-from kgs import DataError
+from kgs import ArgumentError, DataError
 from kgs.datasets.synthetic import views_beyond
 from kgs.study.beyond import beyond_cell, beyond_cells
 from kgs.study.cells import sparse_cell
@@ -42,10 +42,10 @@ def scores_of_shape(*shape):
 
 
 CASES = [
-    ("preset", ValueError, lambda folder: sparse_cells("fast", folder)),
-    ("scenes", ValueError, lambda folder: select(sparse_cells("quick", folder), scenes=["fern"])),
-    ("views", ValueError, lambda folder: select(sparse_cells("quick", folder), views=[4])),
-    ("cells", ValueError, lambda folder: select(sparse_cells("quick", folder), methods=["far"], seeds=[1])),
+    ("preset", ArgumentError, lambda folder: sparse_cells("fast", folder)),
+    ("scenes", ArgumentError, lambda folder: select(sparse_cells("quick", folder), scenes=["fern"])),
+    ("views", ArgumentError, lambda folder: select(sparse_cells("quick", folder), views=[4])),
+    ("cells", ArgumentError, lambda folder: select(sparse_cells("quick", folder), methods=["far"], seeds=[1])),
     ("KGS_DATA", DataError, lambda _: sparse_cells("cpu", None)),
     ("FOLDER: llff/fern", DataError, lambda folder: sparse_cells("cpu", folder)),
     ("FOLDER", DataError, lambda folder: sparse_cells("paper", folder)),
@@ -54,29 +54,32 @@ CASES = [
     ("llff/fern", DataError, lambda _: sparse_cell(tiny_cell() | {"scene": "llff/fern"})),
     ("llff/fern", DataError, lambda _: beyond_cell(tiny_cell() | {"scene": "llff/fern"})),
     *[
-        ("out, count", ValueError, lambda _, out=out, count=count: views_beyond(out, count, (6, 8)))
+        ("out, count", ArgumentError, lambda _, out=out, count=count: views_beyond(out, count, (6, 8)))
         for out, count in ((0.0, 6), (float("nan"), 6), (1.0, 0))
     ],
-    *[("steps", ValueError, lambda _, steps=steps: with_steps([tiny_cell()], steps)) for steps in (0, -1)],
-    ("steps", ValueError, lambda folder: study(out=folder, steps=0)),
+    *[("steps", ArgumentError, lambda _, steps=steps: with_steps([tiny_cell()], steps)) for steps in (0, -1)],
+    ("steps", ArgumentError, lambda folder: study(out=folder, steps=0)),
     *[
-        ("table", ValueError, lambda folder, table=table: cells_of_table([tiny_cell()], table, folder))
+        ("table", ArgumentError, lambda folder, table=table: cells_of_table([tiny_cell()], table, folder))
         for table in (0, 7)
     ],
     ("FOLDER/colmap", DataError, lambda folder: cells_of_table([tiny_cell()], 2, folder)),  # has no scene of the table
-    ("table", ValueError, lambda folder: study(out=folder, table=1)),
-    ("opacities", ValueError, lambda _: opacity_l1(torch.rand(3, 1), torch.rand(3, 1))),
-    ("scores", ValueError, lambda _: opacity_l1(torch.rand(3), torch.rand(4))),
-    ("cells", ValueError, lambda folder: run_grid([{"x": 1}, {"x": 1}], json.dumps, folder / "g.jsonl")),
-    ("processes", ValueError, lambda folder: run_grid([{"x": 1}], json.dumps, folder / "g.jsonl", processes=0)),
-    ("FOLDER/g.jsonl: line 1", ValueError, damaged_lines),
-    ("FOLDER/g.jsonl: line 2", ValueError, lines_of_others),
-    ("subsets", ValueError, lambda _: coadaptation(None, None, subsets=1)),
-    ("rows", ValueError, lambda _: cells_frame([])),
-    ("rows", ValueError, lambda _: cells_frame([ROW, ROW])),
-    ("rows", ValueError, lambda folder: write_report([], folder, "command", 0)),
-    ("rows", ValueError, lambda folder: write_report([ROW, LONGER], folder, "command", 2)),
-    *[("scores", ValueError, lambda _, shape=shape: scores_of_shape(*shape)) for shape in ((4,), (5, 1), (2, 5), (0,))],
+    ("table", ArgumentError, lambda folder: study(out=folder, table=1)),
+    ("opacities", ArgumentError, lambda _: opacity_l1(torch.rand(3, 1), torch.rand(3, 1))),
+    ("scores", ArgumentError, lambda _: opacity_l1(torch.rand(3), torch.rand(4))),
+    ("cells", ArgumentError, lambda folder: run_grid([{"x": 1}, {"x": 1}], json.dumps, folder / "g.jsonl")),
+    ("processes", ArgumentError, lambda folder: run_grid([{"x": 1}], json.dumps, folder / "g.jsonl", processes=0)),
+    ("FOLDER/g.jsonl: line 1", DataError, damaged_lines),
+    ("FOLDER/g.jsonl: line 2", DataError, lines_of_others),
+    ("subsets", ArgumentError, lambda _: coadaptation(None, None, subsets=1)),
+    ("rows", ArgumentError, lambda _: cells_frame([])),
+    ("rows", ArgumentError, lambda _: cells_frame([ROW, ROW])),
+    ("rows", ArgumentError, lambda folder: write_report([], folder, "command", 0)),
+    ("rows", ArgumentError, lambda folder: write_report([ROW, LONGER], folder, "command", 2)),
+    *[
+        ("scores", ArgumentError, lambda _, shape=shape: scores_of_shape(*shape))
+        for shape in ((4,), (5, 1), (2, 5), (0,))
+    ],
 ]
 
 

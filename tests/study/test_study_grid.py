@@ -14,6 +14,7 @@ from unittest import mock
 import pytest
 from grid_cells import cells_in, do, processes_left, threads_of_torch, times_done
 
+from kgs import DataError
 from kgs.study import grid
 from kgs.study.grid import read_rows, run_grid
 
@@ -83,7 +84,7 @@ def test_a_file_belongs_to_one_run_at_a_time(tmp_path, threads):
     path, refused = tmp_path / "rows.jsonl", []
 
     def second(line):
-        with pytest.raises(ValueError, match=r"rows\.jsonl: expected no other run") as error:
+        with pytest.raises(DataError, match=r"rows\.jsonl: expected no other run") as error:
             run_grid(CELLS, square, path, scheduler=threads, say=quiet)
         refused.append(error)
 

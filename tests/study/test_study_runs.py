@@ -131,7 +131,7 @@ def test_the_report_of_another_preset_is_not_overwritten(unchanged, monkeypatch,
 
 
 def test_a_second_run_is_refused_and_writes_nothing(unchanged, threads):
-    with grid._alone(unchanged / "sparse.jsonl"), pytest.raises(ValueError, match="expected no other run"):
+    with grid._alone(unchanged / "sparse.jsonl"), pytest.raises(DataError, match="expected no other run"):
         study(out=unchanged, scheduler=threads)
 
 

@@ -22,8 +22,7 @@ def main(arguments: list[str] | None = None) -> None:
         arguments: the words after `kgs`; those of this process unless given.
 
     Raises:
-        SystemExit: always. The code is 0, 2 for a mistake of the user, 1 for a failure, or 128 + the number of the
-            signal that ended the work.
+        SystemExit: always, with one of the codes that docs/command.md lists.
     """
     leave_at_once()
     wait_passively()

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from kgs._support.errors import DataError
+from kgs._support.errors import ArgumentError, DataError
 from kgs.datasets.folders import has_photos
 from kgs.datasets.options import held_out_between_ends
 from kgs.datasets.source import SceneSource
@@ -13,7 +13,7 @@ SMALLEST = 32  # pixels of the longer side of a fit's photos
 def check_roll(roll: float) -> None:
     """Raise a ValueError unless this is an angle by which pictures can be turned."""
     if not -360 <= roll <= 360:
-        raise ValueError(f"roll: expected degrees in [-360, 360], got {roll}")
+        raise ArgumentError(f"roll: expected degrees in [-360, 360], got {roll}")
 
 
 def check_file(out: Path, ending: str, kind: str, source: Path | None = None) -> None:
@@ -24,11 +24,11 @@ def check_file(out: Path, ending: str, kind: str, source: Path | None = None) ->
     from kgs.app.files.publishing import check_free
 
     if out.suffix.lower() != ending:
-        raise ValueError(f"out: expected a file that ends in {ending}, got {str(out)!r}")
+        raise ArgumentError(f"out: expected a file that ends in {ending}, got {str(out)!r}")
     if out.is_dir():
         raise DataError(out, "", "expected a file, found a folder of this name")
     if source is not None and out.exists() and out.samefile(source):
-        raise ValueError(f"out: expected another file than {str(source)!r}, which is read")
+        raise ArgumentError(f"out: expected another file than {str(source)!r}, which is read")
     if not out.absolute().parent.is_dir():
         raise DataError(out, "", "expected a file in a folder that is there")
     check_free(out.parent, kind, [out.name])
@@ -44,13 +44,15 @@ def check_photos_of(source: SceneSource) -> None:
 def check_results(out: Path) -> None:
     """Raise a DataError unless this is the folder of the results of a fit."""
     from kgs._support.json_files import read_json
+    from kgs.app.files.locks import locked
     from kgs.app.files.publishing import UNFINISHED, complete
     from kgs.app.files.results_folder import has_fit
 
     complete(out)
     config = out / "config.json"
     if not config.exists() and has_fit(out / UNFINISHED):
-        raise DataError(out, "", "holds a fit that is not done: kgs fit --resume goes on with it")
+        with locked(out):  # or it is at work
+            raise DataError(out, "", "holds a fit that is not done: kgs fit --resume goes on with it")
     if not config.exists():
         raise DataError(config, "", "cannot be read: expected the folder of the results of kgs fit")
     read_json(config)
@@ -99,7 +101,7 @@ def check_photos(
     for side, minimum, pixels in (("longer", SMALLEST, max(reduced)), ("shorter", shortest, min(reduced))):
         if pixels < minimum:
             got = f"{reduced[0]}x{reduced[1]} of {width}x{height}"
-            raise ValueError(f"{name}: expected {minimum} pixels or more of the {side} side, got {got}")
+            raise ArgumentError(f"{name}: expected {minimum} pixels or more of the {side} side, got {got}")
 
 
 def _check_views(views: int | None, hold_out: int | None, count: int, what: str) -> None:
@@ -107,4 +109,4 @@ def _check_views(views: int | None, hold_out: int | None, count: int, what: str)
     maximum = count - len(held_out_between_ends(count - 2, hold_out)) if hold_out else count
     if views is not None and views > maximum:
         rest = f" of which {count - maximum} are held out" if hold_out else ""
-        raise ValueError(f"views: expected at most {maximum} of {count} {what}{rest}, got {views}")
+        raise ArgumentError(f"views: expected at most {maximum} of {count} {what}{rest}, got {views}")

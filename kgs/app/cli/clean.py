@@ -4,7 +4,7 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kgs._support.errors import DataError, printable
+from kgs._support.errors import ArgumentError, DataError, printable
 from kgs.app.console import VIEWER, as_line, each, say, say_next
 from kgs.fit.config import Backend, Background
 
@@ -65,10 +65,10 @@ def clean(
     if splat.is_dir():
         for name, value in (("cameras", cameras), ("downscale", downscale)):
             if value is not None:
-                raise ValueError(f"{name}: expected a PLY file as SPLAT, got a folder, which has its own scene")
+                raise ArgumentError(f"{name}: expected a PLY file as SPLAT, got a folder, which has its own scene")
         check_results(splat)
     elif cameras is None and downscale is not None:
-        raise ValueError("downscale: expected --cameras with it, got none")
+        raise ArgumentError("downscale: expected --cameras with it, got none")
     torch_device = load_tools(device, backend)
 
     from kgs.app.files.publishing import replacing

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from kgs._support.errors import printable
+from kgs._support.errors import ArgumentError, printable
 from kgs.app.console import VIEWER, as_line, each, say, say_next
 from kgs.fit.config import DEMO, DEMO_STEPS, DROP, ROOM_DEMO, Backend, FitConfig
 
@@ -97,10 +97,10 @@ def load_demo(name: str, size: tuple[int, int], seed: int) -> "Scene":
 def check_size(scene: str, size: tuple[int, int]) -> None:
     """Raise a ValueError where pictures of this size would be too small for the SSIM."""
     if min(size) < MIN_SIDE:
-        raise ValueError(f"size: expected at least {MIN_SIDE} pixels a side, got {size[0]} {size[1]}")
+        raise ArgumentError(f"size: expected at least {MIN_SIDE} pixels a side, got {size[0]} {size[1]}")
     if scene == "bananas" and min(PHOTO_SIZE) / _reduction(size) < MIN_SIDE:
         min_width = math.ceil(MIN_SIDE * PHOTO_SIZE[1] / PHOTO_SIZE[0])
-        raise ValueError(f"size: expected at least {MIN_SIDE} {min_width} for these photos, got {size[0]} {size[1]}")
+        raise ArgumentError(f"size: expected at least {MIN_SIDE} {min_width} for these photos, got {size[0]} {size[1]}")
 
 
 def _reduction(size: tuple[int, int]) -> float:

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from kgs._support.errors import DataError, printable
+from kgs._support.errors import printable
 from kgs.app.console import as_line, say, say_next
 from kgs.fit.config import Backend
 
@@ -28,17 +28,24 @@ def evaluate(
         device: cpu, cuda, ...
         backend: auto: that of the fit. kgs fit --help-all describes the others.
     """
-    from kgs.app.files.publishing import check_free, replacing
+    from kgs.app.files.locks import locked
     from kgs.metrics.weights import weight_files
 
     if lpips_weights is not None:
         weight_files(lpips_weights)
     check_results(out)
+    with locked(out):  # a fit would change the files that are read, and take the place of what is written
+        _evaluate(out, lpips_weights, device, backend)
+
+
+def _evaluate(out: Path, lpips_weights: Path | None, device: str, backend: Backend) -> None:
+    """Measure the fit in a folder that is locked."""
+    from kgs.app.files.publishing import check_free, replacing
+
     check_free(out, "fit", ("metrics.json", "index.html"))
     load_tools(device, backend, "jinja2")
 
     from kgs._support.json_files import read_json, write_json
-    from kgs.app.files.locks import locked
     from kgs.app.page.fit_page import PAGE, write_own_page
     from kgs.app.saved_fit import load_fit
     from kgs.fit.measures import measure_again
@@ -49,9 +56,7 @@ def evaluate(
     request, fit = load_fit(out, device, backend, say)
     path = out / "metrics.json"
     metrics = measure_again(fit, path, lpips)
-    with locked(out), replacing(out, "fit") as new:
-        if read_json(path) != fit.metrics:
-            raise DataError(out, "", "a new fit took the place of the one that was measured: measure again")
+    with replacing(out, "fit") as new:
         write_json(new / path.name, metrics)
         write_own_page(new, out, fit.annotated(metrics=metrics), request, read_json(out / "config.json"))
     say(as_text(metrics))

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 import tyro
 
-from kgs._support.errors import DataError, printable
+from kgs._support.errors import ArgumentError, DataError, printable
 from kgs.app.console import VIEWER, as_line, say, say_next
 from kgs.fit.config import COARSE, DETAILS, PRESETS, Background, FitConfig, min_side
 
@@ -115,7 +115,7 @@ def fit(
     check_roll(roll)
     _check_size(size, downscale, unposed)
     if views is not None and views < 1:
-        raise ValueError(f"views: expected a whole number of at least 1, got {views}")
+        raise ArgumentError(f"views: expected a whole number of at least 1, got {views}")
     check_options(downscale, hold_out)
     _check_frames(frames, scene)
     if lpips_weights is not None:
@@ -132,7 +132,7 @@ def fit(
         check_photos_of(source)
     if config.init == "scene" and (source is None or source.layout != "Blender"):
         kind = "photos without camera poses" if source is None else f"the layout {source.layout}"
-        raise ValueError(f"init: expected another one for {kind}, got 'scene', Blender's points")
+        raise ArgumentError(f"init: expected another one for {kind}, got 'scene', Blender's points")
     load_tools(config.device, config.backend, "safetensors", "jinja2")
 
     from kgs.app.fit_folder import fit_folder
@@ -191,7 +191,7 @@ def fit(
         reason = f"expected at least {SMALLEST} pixels, got photos of {width}x{height}"
         if downscale is None:  # a size that is too small is refused before
             raise DataError(scene, "images", reason)
-        raise ValueError(f"downscale: {reason}")
+        raise ArgumentError(f"downscale: {reason}")
     say(f"{printable(scene)}: {len(loaded.train)} training and {len(loaded.test)} test views of {width}x{height}")
     with on_ctrl_c("the cameras that were found are kept" if unposed else ""):
         published = fit_folder(loaded, config, out, request, resume=resume, lpips=lpips, live=live, stages=stages)
@@ -243,13 +243,13 @@ def short_help(config: FitConfig) -> type[Any]:
 def _check_size(size: int | str | None, downscale: float | None, unposed: bool) -> None:
     """Raise a ValueError unless the photos can have this size."""
     if size is not None and downscale is not None:
-        raise ValueError("size: expected either a size or a downscale factor, got both")
+        raise ArgumentError("size: expected either a size or a downscale factor, got both")
     if isinstance(size, str) and re.fullmatch(r"field|images(_\d+)?", size) is None:
-        raise ValueError(f"size: expected pixels, field or a folder as images_8, got {size!r}")
+        raise ArgumentError(f"size: expected pixels, field or a folder as images_8, got {size!r}")
     if isinstance(size, str) and unposed:
-        raise ValueError(f"size: expected pixels for photos without camera poses, got {size!r}")
+        raise ArgumentError(f"size: expected pixels for photos without camera poses, got {size!r}")
     if isinstance(size, int) and size < SMALLEST:
-        raise ValueError(f"size: expected at least {SMALLEST} pixels, got {size}")
+        raise ArgumentError(f"size: expected at least {SMALLEST} pixels, got {size}")
 
 
 def _check_frames(frames: int | None, scene: Path) -> None:
@@ -257,6 +257,6 @@ def _check_frames(frames: int | None, scene: Path) -> None:
     from kgs.app.sfm.find import MIN_PHOTOS, find_video
 
     if frames is not None and frames < MIN_PHOTOS:
-        raise ValueError(f"frames: expected at least {MIN_PHOTOS}, got {frames}")
+        raise ArgumentError(f"frames: expected at least {MIN_PHOTOS}, got {frames}")
     if frames is not None and find_video(scene) is None:
-        raise ValueError("frames: expected a video to take them from, got photos")
+        raise ArgumentError("frames: expected a video to take them from, got photos")

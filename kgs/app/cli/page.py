@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kgs._support.errors import printable
+from kgs._support.errors import ArgumentError, printable
 from kgs.app.console import as_line, say, say_next
 from kgs.fit.config import Backend, Background
 
@@ -68,7 +68,7 @@ def page(
     scene = load_cameras(source, downscale, background=background)
     height, width = scene.train.images.shape[-2:]
     if min(height, width) < WINDOW:
-        raise ValueError(f"downscale: expected photos of at least {WINDOW} pixels a side, got {width}x{height}")
+        raise ArgumentError(f"downscale: expected photos of at least {WINDOW} pixels a side, got {width}x{height}")
     fit = load_splat(ply, scene, torch_device, backend)
     few = spread(len(scene.train), MAX_PICTURES)
     photographed = load_scene(source, len(few), downscale, hold_out=0, background=background)

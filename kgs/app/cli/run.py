@@ -9,7 +9,9 @@ import errno
 import inspect
 import pkgutil
 import re
+import signal
 import sys
+import traceback
 import warnings
 from collections.abc import Callable
 from dataclasses import fields
@@ -17,7 +19,7 @@ from functools import partial, wraps
 from pathlib import Path
 from typing import Any
 
-from kgs._support.errors import DataError, TrainingDiverged, printable
+from kgs._support.errors import ArgumentError, DataError, PhotosRefused, TrainingDiverged, printable
 from kgs.app.console import as_line, say
 from kgs.fit.config import FitConfig, Recipe
 
@@ -39,6 +41,11 @@ COMMANDS = {
     "bench extremes": "kgs.app.cli.bench:extremes",
     "study": "kgs.study.command:study",
 }
+FAILED = 1  # a package, memory or disk space was missing, training diverged, or kgs check found something wrong
+WRONG_WORDS = 2  # as of tyro
+WRONG_FILE = 3
+REFUSED_PHOTOS = 4
+BUG = 70  # EX_SOFTWARE of sysexits.h
 _USER_ERRORS = {
     errno.EACCES,
     errno.EEXIST,
@@ -53,10 +60,9 @@ _HELP = {"-h", "--help", "help"}
 
 
 def exit_code(words: list[str]) -> int:
-    """Run one command; errors and warnings are a line each, on stderr."""
+    """Run one command; errors and warnings are a line each, on stderr. docs/command.md lists the codes."""
     warnings.showwarning = lambda text, *_: say(f"kgs: {text}", sys.stderr)
     flags: dict[str, str] = {}
-    code = 2
     try:
         name, words = _find(words)
         command = load_command(name)
@@ -66,38 +72,50 @@ def exit_code(words: list[str]) -> int:
     except SystemExit as stop:
         if not isinstance(stop.code, str):
             return stop.code or 0
+        code = WRONG_WORDS
         message = stop.code
-    except ImportError as error:
-        message = explain_import_error(error)
-    except DataError as error:
-        message = str(DataError(error.path, flags.get(error.field, error.field), error.reason))
-    except ValueError as error:
-        argument, colon, reason = str(error).partition(":")
-        if re.match(r"\w+: ", str(error)) is None and " expected " not in str(error):
-            raise  # a mistake in kgs: messages for users begin with a name
-        message = printable(flags.get(argument, argument) + colon + reason)
-    except TrainingDiverged as error:
-        message = printable(f"training diverged: {error}")
-        code = 1
     except BrokenPipeError:
         return 0  # the reader has what it wanted
-    except OSError as error:
-        prefix = f"{printable(error.filename)}: " if error.filename else ""
-        message = f"{prefix}{error.strerror}"
-        code = 2 if error.errno in _USER_ERRORS else 1
-    except (MemoryError, RuntimeError) as error:
-        is_memory = isinstance(error, MemoryError) or any(word in str(error) for word in ("allocate", "of memory"))
-        if not is_memory:  # torch and CUDA say so in a RuntimeError
-            raise
-        message = f"not enough memory: {error}".partition("\n")[0]
-        code = 1
     except KeyboardInterrupt as stop:
+        code = 128 + signal.SIGINT
         message = f"stopped: {stop}" if str(stop) else "stopped"
-        code = 130
+    except Exception as error:
+        code, message = _explain(error, flags)
     finally:
         interrupt_as_usual()
     say(f"kgs: {message}", sys.stderr)
     return code
+
+
+def _explain(error: Exception, flags: dict[str, str]) -> tuple[int, str]:
+    """The exit code and the line of an error; what is no mistake of the user shows its traceback, too.
+
+    A mistake of the user is known by its class, :class:`kgs.ArgumentError` or :class:`kgs.DataError`.
+    """
+    match error:
+        case DataError():
+            code = REFUSED_PHOTOS if isinstance(error, PhotosRefused) else WRONG_FILE
+            return code, str(DataError(error.path, flags.get(error.field, error.field), error.reason))
+        case ArgumentError():
+            argument, colon, reason = str(error).partition(":")
+            return WRONG_WORDS, printable(flags.get(argument, argument) + colon + reason)
+        case ImportError() if explanation := explain_import_error(error):
+            return FAILED, explanation
+        case TrainingDiverged():
+            return FAILED, printable(f"training diverged: {error}")
+        case OSError():
+            code = WRONG_FILE if error.errno in _USER_ERRORS else FAILED
+            prefix = f"{printable(error.filename)}: " if error.filename else ""
+            return code, prefix + (error.strerror or printable(error))
+        case MemoryError() | RuntimeError() if _is_of_memory(error):
+            return FAILED, f"not enough memory: {error}".partition("\n")[0]
+    say("".join(traceback.format_exception(error)).rstrip(), sys.stderr)
+    return BUG, "this is a mistake in kgs: please report it, with the lines above and those of kgs check"
+
+
+def _is_of_memory(error: Exception) -> bool:
+    """Whether memory ran out: torch and CUDA say so in a RuntimeError."""
+    return isinstance(error, MemoryError) or any(word in str(error) for word in ("allocate", "of memory"))
 
 
 def _find(words: list[str]) -> tuple[str, list[str]]:
@@ -166,7 +184,7 @@ def _check_out(command: Callable[..., Any], name: str, words: list[str]) -> None
     if is_given or not is_needed or "--" in words or not words or words[0].startswith("-"):
         return
     if not words[0]:
-        raise ValueError(f"{next(iter(inspect.signature(command).parameters))}: expected a path, got ''")
+        raise ArgumentError(f"{next(iter(inspect.signature(command).parameters))}: expected a path, got ''")
     folder = f"{Path(words[0]).resolve().stem}-{name.rpartition(' ')[2]}"
     whole = as_line("kgs", *name.split(), *words, "-o", folder)
     raise SystemExit(f"-o: expected a folder for the results, for example {whole}")
@@ -189,7 +207,7 @@ def _parse(command: Callable[..., Any], name: str, words: list[str]) -> partial[
         config = bound.get("config")
         for option, value in [*bound.items(), ("init_file", config and config.init_file)]:
             if value is EMPTY:
-                raise ValueError(f"{option}: expected a path, got ''")
+                raise ArgumentError(f"{option}: expected a path, got ''")
         return partial(command, *arguments, **options)
 
     function: Callable[..., partial[Any]] = bind

@@ -61,7 +61,7 @@ def load_package(package: str) -> None:
 
 
 def explain_import_error(error: ImportError) -> str:
-    """What to do about a package that is missing or broken; raises the error again where that is a mistake in kgs."""
+    """What to do about a package that is missing or broken; "" where that is a mistake in kgs."""
     if isinstance(error, ModuleNotFoundError):
         package = (error.name or "").partition(".")[0]
     else:
@@ -69,7 +69,7 @@ def explain_import_error(error: ImportError) -> str:
         tops = [name.partition(".")[0] for name in [error.name or "", *names]]
         package = next((top for top in tops if top not in ("", "kgs", *sys.stdlib_module_names)), "kgs")
     if package == "kgs":
-        raise error
+        return ""
     if package == "triton":  # torch brings it
         return str(error)
     if isinstance(error, ModuleNotFoundError):

@@ -16,6 +16,7 @@ from kornia.geometry.conversions import rotation_matrix_to_quaternion
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kgs._support.errors import ArgumentError
 from kgs._support.json_files import write_whole
 from kgs._support.version import __version__
 from kgs.harmonics import SH_C0
@@ -59,11 +60,11 @@ def save_glb(
     """
     check_kind("model", model, GaussianModel)
     if tuple(rotation.shape) != (3, 3) or not bool(rotation.isfinite().all()):
-        raise ValueError(f"rotation: expected finite numbers of shape (3, 3), got {rotation.tolist()}")
+        raise ArgumentError(f"rotation: expected finite numbers of shape (3, 3), got {rotation.tolist()}")
     attributes = _attributes(model)
     for name, values in attributes.items():
         if not np.isfinite(values).all():
-            raise ValueError(f"model: expected values that are finite in float32, got NaN or infinity in {name}")
+            raise ArgumentError(f"model: expected values that are finite in float32, got NaN or infinity in {name}")
     matrix = rotation.double().cpu()
     quaternion = rotation_matrix_to_quaternion(matrix)[[1, 2, 3, 0]]  # from w, x, y, z to x, y, z, w
     translation = torch.zeros(3, dtype=torch.float64, device="cpu")

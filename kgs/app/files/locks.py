@@ -36,8 +36,12 @@ def held(path: Path, wait: bool = False, unknown: bool = True) -> Iterator[bool]
 
 @contextmanager
 def locked(out: Path) -> Iterator[None]:
-    """Keep other fits out of a folder until the block or the process ends; DataError if one is at work there."""
+    """Keep other fits, and `kgs eval`, out of a folder until the block or the process ends.
+
+    Raises:
+        DataError: one of them is at work there.
+    """
     with held(out / ".lock") as ours:
         if not ours:
-            raise DataError(out, "", "another fit is at work in this folder: wait for it or choose another folder")
+            raise DataError(out, "", "kgs is at work on the fit in this folder: wait for it or choose another folder")
         yield

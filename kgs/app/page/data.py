@@ -23,6 +23,7 @@ from kornia.geometry.camera import PinholeCamera
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kgs._support.errors import ArgumentError
 from kgs.geometry import camera_centers
 from kgs.harmonics import SH_C0
 from kgs.projection import finite_gaussians
@@ -121,7 +122,7 @@ def pack(
     while len(packed.content) > max_bytes:
         count = min(count - 1, math.floor(_TARGET_SHARE * count * max_bytes / len(packed.content)))
         if count < 1:
-            raise ValueError(f"max_bytes: expected room for a Gaussian, got {max_bytes} bytes")
+            raise ArgumentError(f"max_bytes: expected room for a Gaussian, got {max_bytes} bytes")
         chosen = {name: value[order[:count]] for name, value in values.items()}
         packed = _gzip(_compressed_columns(chosen, cameras, near_plane, COARSE, 0), 0)
     words += [*reductions, f"{count} of {len(rows)} Gaussians"]

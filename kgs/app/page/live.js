@@ -8,7 +8,7 @@ const MAX_RETRIES = 3;
 // What is newer than a version, as { version, text, isOver, splat }; null if nothing came for a while. `splat` is
 // absent where it has not changed. The answer is a line of JSON, and the float32 of each column in turn.
 async function newerThan(version) {
-  const answer = await fetch(`/splat?after=${version}`, { cache: "no-store" });
+  const answer = await fetch(`splat?after=${version}`, { cache: "no-store" });
   if (answer.status === 204) return null;
   if (!answer.ok) throw new Error(answer.statusText);
   const bytes = new Uint8Array(await answer.arrayBuffer());

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from torch import Tensor
 
+from kgs._support.errors import ArgumentError
 from kgs.app.files.images import eight_bits
 from kgs.datasets.splits import select_evenly
 
@@ -118,5 +119,5 @@ def _data_uri(image: Tensor, side: int, quality: int = _JPEG_QUALITY) -> str:
         array = np.asarray(cv2.resize(array, size, interpolation=cv2.INTER_AREA), np.uint8)
     done, content = cv2.imencode(".jpg", array, [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
-        raise ValueError(f"image: expected one that can be encoded as JPEG, got {width}x{height} pixels")
+        raise ArgumentError(f"image: expected one that can be encoded as JPEG, got {width}x{height} pixels")
     return "data:image/jpeg;base64," + base64.b64encode(content.tobytes()).decode()

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from kgs._support.errors import DataError
+from kgs._support.errors import PhotosRefused
 from kgs._support.progress import ProgressBar
 
 from .gates import Pairs, focal_difference, focal_doubt, is_forward, judge, why_no_cameras
@@ -57,7 +57,7 @@ def agreed_cameras(
         say: called with each line for the user.
 
     Raises:
-        DataError: the photos do not fit together, or not even three cameras can be trusted.
+        PhotosRefused: the photos do not fit together, or not even three cameras can be trusted.
     """
     folder = photos[0].path.parent
     first = work / "first.db"
@@ -81,7 +81,7 @@ def agreed_cameras(
         kept = {image: name for image, name in names.items() if name not in left_out}
         geometries = {pair: geometry for pair, geometry in geometries.items() if left_out.keys().isdisjoint(pair)}
         if reason := why_no_cameras(list(kept.values()), pairs, geometries):
-            raise DataError(folder, "", reason)
+            raise PhotosRefused(folder, "", reason)
         solvers = _Solvers((first, second), second_matches, images, work, seed, exif_focals(photos), executor, pairs)
         solutions, held = solvers.solve(kept)
         while untrusted := without_cameras(solutions, list(kept.values()), pairs):

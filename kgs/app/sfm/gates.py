@@ -11,7 +11,7 @@ from pathlib import Path
 
 import torch
 
-from kgs._support.errors import DataError
+from kgs._support.errors import PhotosRefused
 from kgs.geometry import degrees_between
 
 from .map import MIN_MATCHES, Cameras, PairGeometry
@@ -103,7 +103,7 @@ def judge(
 ) -> tuple[int, float]:
     """The index of the cameras that pass the gates, and the solvers' largest difference in degrees.
 
-    A DataError if none pass.
+    A PhotosRefused if none pass.
 
     If both pass, it is that of those whose worst photo sees more points.
 
@@ -118,24 +118,24 @@ def judge(
     reasons = [objections(cameras, names, longest) for cameras in solutions]
     good = {i: cameras for i, cameras in enumerate(solutions) if cameras and not reasons[i]}
     if not good:
-        raise DataError(folder, "", refusal(reasons[0], names, pairs, forward, _missing(solutions[0], names)))
+        raise PhotosRefused(folder, "", refusal(reasons[0], names, pairs, forward, _missing(solutions[0], names)))
     for cameras in solutions:  # nothing confirms a photo that only one solver registered
         if missing := _missing(cameras, names):
             who = ", ".join(missing)
             reason = f"kgs finds the cameras in two ways, and only one could place {who}, so that nothing confirms it"
-            raise DataError(folder, "", refusal([reason], names, pairs, forward, missing))
+            raise PhotosRefused(folder, "", refusal([reason], names, pairs, forward, missing))
     both = [cameras for cameras in solutions if cameras]
     if doubt := focal_doubt(both):
-        raise DataError(folder, "", focal_refusal(doubt, names, pairs, forward))
+        raise PhotosRefused(folder, "", focal_refusal(doubt, names, pairs, forward))
     degrees, pair = disagreement(*both)
     if degrees > MAX_DEGREES:
         reason = (
             f"kgs finds the cameras in two ways, and they disagree about {' and '.join(pair)} (by "
             f"{degrees:.3g} degrees; expected at most {MAX_DEGREES:g})"
         )
-        raise DataError(folder, "", refusal([reason], names, pairs, forward))
+        raise PhotosRefused(folder, "", refusal([reason], names, pairs, forward))
     if doubt := focal_difference(both):
-        raise DataError(folder, "", focal_refusal(doubt, names, pairs, forward))
+        raise PhotosRefused(folder, "", focal_refusal(doubt, names, pairs, forward))
     sure = {i: cameras for i, cameras in good.items() if cameras.focal_rise >= MIN_RISE} or good
     return max(sure, key=lambda i: min(sure[i].points.values())), degrees
 

@@ -9,7 +9,7 @@ register it, it has to see enough points, and both have to agree about it and it
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 
-from kgs._support.errors import DataError
+from kgs._support.errors import PhotosRefused
 
 from .find import MIN_PHOTOS, listed_files
 from .gates import MAX_DEGREES, MAX_RATIO, MIN_POINTS, MIN_SHIFT, Pairs, angle_between, gap, groups_of, matches_of
@@ -21,15 +21,15 @@ def unlike_others(photos: list[OpenPhoto]) -> dict[str, str]:
     """Photos that are copies, or of another shape than most without a focal length in their Exif, and why.
 
     Raises:
-        DataError: most photos are panoramas, there are fewer than `MIN_PHOTOS` without copies, or no shape is that of
-            most.
+        PhotosRefused: most photos are panoramas, there are fewer than `MIN_PHOTOS` without copies, or no shape is that
+            of most.
     """
     folder = photos[0].path.parent
     panoramas = [photo.path for photo in photos if photo.is_panorama]
     if 2 * len(panoramas) > len(photos):
         line = f'ffmpeg -i "{panoramas[0].name}" -vf v360=e:rectilinear:h_fov=90:v_fov=67:yaw=0 yaw_0.jpg'
         reason = f"is a panorama, not a picture of a lens. Cut some from it: `{line}`, the same for other angles"
-        raise DataError(panoramas[0], "", reason)
+        raise PhotosRefused(panoramas[0], "", reason)
     first = {photo.sha256: photo.name for photo in reversed(photos)}
     copied = {photo.name: first[photo.sha256] for photo in photos if first[photo.sha256] != photo.name}
     left = {name: f"it is the same photo as {other}" for name, other in copied.items()}
@@ -37,13 +37,13 @@ def unlike_others(photos: list[OpenPhoto]) -> dict[str, str]:
         name, other = next(iter(copied.items()))
         advice = "two copies show no depth. Remove one, and take another photo from a step to the side"
         reason = f"is the same photo as {other}: {advice}"
-        raise DataError(photos[0].path.with_name(name), "", reason)
+        raise PhotosRefused(photos[0].path.with_name(name), "", reason)
     photos = [photo for photo in photos if photo.name not in left]
     shapes = by_shape(photos)
     if (usual := _usual(shapes)) is None:
         groups = _listed(shapes)
         reason = f"expected photos of one shape, got {len(shapes)} ({groups}). Keep one group in the folder"
-        raise DataError(folder, "", f"{reason}. Cropped photos do not fit those that are whole")
+        raise PhotosRefused(folder, "", f"{reason}. Cropped photos do not fit those that are whole")
     return left | {
         photo.name: f"its shape is {name}, not {usual}, and no Exif says its focal length: is it cropped?"
         for photo, name in _of_unknown_lens(shapes, usual)

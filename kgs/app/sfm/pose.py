@@ -85,8 +85,9 @@ def pose_photos(
         "seconds" and others; "reused": whether a former run wrote it; and "folder": where the scene is.
 
     Raises:
-        DataError: the folder holds no photos that fit together, or their cameras cannot be trusted; the message says
-            what to do, with the number of matches of each pair.
+        DataError: the folder holds no photos, some cannot be read, or `out` cannot take the results.
+        PhotosRefused: the photos do not fit together, or their cameras cannot be trusted; the message says what to do,
+            with the number of matches of each pair.
         ModuleNotFoundError: pycolmap is not installed (extra `sfm`).
         OSError: a result cannot be written.
     """
@@ -140,7 +141,8 @@ def _pose_video(video: Path, out: Path, frames: int | None, options: dict[str, A
         try:
             return pose_photos(folder, out, **options)
         except DataError as error:
-            raise DataError(video if Path(error.path) == folder else error.path, error.field, error.reason) from error
+            path = video if Path(error.path) == folder else error.path
+            raise type(error)(path, error.field, error.reason) from error
 
 
 def find_cameras(
@@ -149,7 +151,7 @@ def find_cameras(
     """Write `images` and `sparse/0` of photos to the folder `new`; returns the report.
 
     Raises:
-        DataError: the photos do not fit together, or their cameras cannot be trusted.
+        PhotosRefused: the photos do not fit together, or their cameras cannot be trusted.
     """
     seconds, lap = _clock()
     unlike = unlike_others(opened)

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kgs._support.errors import DataError
+from kgs._support.errors import DataError, PhotosRefused
 from kgs._support.progress import ProgressBar
 from kgs.app.files.encoders import NOT_UTF8, for_opencv
 from kgs.app.files.outputs import write_png
@@ -66,14 +66,14 @@ def take_frames(
         say: called with a line about the frames.
 
     Raises:
-        DataError: the file is not a video that can be read, or the camera moves too little in it.
+        DataError: the file is not a video that can be read; PhotosRefused: the camera moves too little in it.
     """
     frames = _look(video, bar)
     way = frames[-1].way
     min_way = _STEP * ((count or MIN_PHOTOS) - 1)
     if way < min_way or len(frames) < MIN_PHOTOS:
         expected = f"expected a video in which the camera moves by {min_way:g} degrees or more"
-        raise DataError(video, "", f"{expected}, got {way:.1f} degrees in {len(frames)} frames")
+        raise PhotosRefused(video, "", f"{expected}, got {way:.1f} degrees in {len(frames)} frames")
     if count is None:
         count = max(MIN_PHOTOS, min(FRAMES, round(way / MIN_DEGREES) + 1))
         count = max(count, min(MAX_FRAMES, math.ceil(way / MAX_DEGREES) + 1))
