@@ -50,7 +50,7 @@ def on_files(files, config):
 def on_page_markdown(markdown, page, config, files):
     """Gives wide tables of results the whole width and links to notebooks their place; the first page has a viewer."""
     if page.file.src_uri == "index.md":
-        markdown = re.sub(r"!\[the page of the demo\]\(pictures/page\.jpg\)", FRAME, markdown)
+        markdown = re.sub(r"!\[the film of the demo\]\(pictures/film\.webp\)", FRAME, markdown)
     if page.file.src_uri.startswith("results/"):
         page.meta["hide"] = ["toc"]
     return markdown.replace("](../notebooks/", "](notebooks/").replace("](../README.md", "](index.md")

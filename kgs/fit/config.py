@@ -2,7 +2,7 @@
 
 Source: the official release of "DropGaussian" (CVPR 2025) for the recipe of the presets `paper` and `plain`, which is
 that of Kerbl et al. 2023 with another densification threshold and without pruning by size. The default does not reset
-opacities, and has harmonics only if the training views need them; docs/recipe.md says what each part gains.
+opacities, and has harmonics only if the training views need them; docs/recipe.md says why.
 """
 
 from dataclasses import asdict, dataclass, field, fields, replace

@@ -10,7 +10,7 @@ over all patches and views, reweighted against outliers.
 
 A fit with gains shows the scene in the mean exposure. Held-out photos have others, so that their PSNR falls even where
 it rises after an affine fit of colours; and shading, reflections and noise give gains, too. Unless they are asked for,
-gains are used only where photos differ much, and gains explain it (docs/photos.md has measurements).
+gains are used only where photos differ much, and gains explain it (docs/photos.md).
 """
 
 from dataclasses import replace

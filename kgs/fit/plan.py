@@ -134,7 +134,7 @@ def gaussian_limit(config: FitConfig, points: int) -> int:
     return config.max_gaussians or max(10 * (config.steps or MANY.steps), 3 * points // 2)
 
 
-# Bytes, fitted to runs of docs/measured.md: of the program, for each Gaussian, for each pixel of all training views.
+# Bytes, fitted to measured runs: of the program, for each Gaussian, for each pixel of all training views.
 _MEMORY = (930 * 2.0**20, 1000.0, 115.0)
 
 

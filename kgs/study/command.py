@@ -38,7 +38,7 @@ def study(
 
     Writes sparse.jsonl (beyond.jsonl), a line per finished fit, and the report, also when it is interrupted; the same
     command goes on where it stopped. For many machines: `dask scheduler` on one, `dask worker ADDRESS --nthreads 1` on
-    each, and --scheduler; docs/paper-tables.md has more on it.
+    each, and --scheduler; docs/sparse-views.md has more on it.
 
     Args:
         out: folder for the results; fits that its JSONL file has are not repeated.

@@ -8,7 +8,7 @@ from kgs._support.errors import ArgumentError, DataError
 from .grid import Cell
 from .published import PUBLISHED, SCENES_OF, benchmark_of
 
-# The benchmark and the name in published.csv of table 1, 2, ..., as docs/paper-tables.md counts them.
+# The benchmark and the name in published.csv of table 1, 2, ..., as docs/sparse-views.md counts them.
 TABLES = (
     ("LLFF", "comparison"),
     ("Mip-NeRF 360", "comparison"),

@@ -197,7 +197,7 @@ def test_the_readme_of_a_published_package_links_to_the_repository(tmp_path):
     made = {path: kind for kind, path in re.findall(address + r"([^)#]+)", after)}
     assert made.keys() == {link.partition("#")[0] for link in links(before)}
     for path, kind in made.items():  # raw: what a browser has to show as it is
-        assert kind == ("raw" if path.endswith((".jpg", ".png", ".html")) else "blob"), path
+        assert kind == ("raw" if path.endswith((".jpg", ".png", ".webp", ".html")) else "blob"), path
 
 
 @pytest.mark.slow

@@ -1,6 +1,6 @@
 """Films as files: MP4 (H.264) by PyAV where it is installed, else WebM (VP8) by OpenCV.
 
-PyAV's packages bring x264, which is GPL (docs/tried.md), so kgs does not ask for them.
+PyAV's packages bring x264, which is GPL (docs/results/tried.md), so kgs does not ask for them.
 """
 
 import contextlib

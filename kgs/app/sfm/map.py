@@ -1,7 +1,7 @@
 """Cameras and points from matches, by COLMAP's incremental mapper with settings for few photos.
 
 Source: J. Schoenberger and J.-M. Frahm, Structure-from-motion revisited, CVPR 2016. Settings that differ from COLMAP's
-were measured (docs/photos.md). Each step runs on one thread, so that the same photos give the same bits.
+were measured (docs/results/cameras). Each step runs on one thread, so that the same photos give the same bits.
 """
 
 import copy
