@@ -70,7 +70,7 @@ def test_it_says_what_the_fit_knows(fitted: Any) -> None:
     assert "<h1>room</h1>" in text
     assert "mine" not in text
     assert "<p>Eleven photos. Drag to look around.<" in text
-    assert text.count(' of 11, held out" style=') == 8
+    assert text.count(' of 11, held out" data-photo') == 8
     assert text.count('<img alt="" src="data:image/jpeg') == 11
     assert "--detail high" not in text  # the photos have the size of the fit
     assert "6 of 8 test photos." in text

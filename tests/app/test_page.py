@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import re
+import time
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -19,7 +21,7 @@ import kgs
 from kgs.app.files.plot import psnr_plot
 from kgs.app.page import PageContent, PagePhotos, PageSplat, PageText, Picture, write_page
 from kgs.app.page.figures import facts, measure_table, verdict, without_folders
-from kgs.app.page.write import MAX_BYTES
+from kgs.app.page.write import MAX_BYTES, live_html
 
 SIZE = (24, 32)
 GAUSSIANS = random_gaussians(1000, 0, torch.float32, sh_degree=1)
@@ -73,6 +75,24 @@ def test_a_page_loads_nothing_and_names_no_path_on_a_disk(tmp_path: Path) -> Non
     assert "&lt;b&gt;&amp;amp;.jpg" in text
     assert "<b>" not in text
     assert str(tmp_path) not in text
+
+
+def test_the_policy_names_the_one_script_and_the_one_style_by_their_sha256(tmp_path: Path) -> None:
+    pictures = [Picture(NAMES[1], torch.rand(3, *SIZE), {})]
+    pages = {
+        write(tmp_path / "index.html", pictures=pictures): "",
+        live_html(content()).decode(): "; connect-src 'self'",
+    }
+    for text, connect in pages.items():
+        hashes = []
+        for kind in ("style", "script"):
+            (code,) = re.findall(rf"<{kind}>(.*?)</{kind}>", text, re.S)
+            hashes.append(base64.b64encode(hashlib.sha256(code.encode()).digest()).decode())
+        (policy,) = re.findall(r'http-equiv="Content-Security-Policy"\s+content="(.*?)"', text)
+        own = "default-src 'none'; img-src data:; style-src 'sha256-{}'; script-src 'sha256-{}'".format(*hashes)
+        assert policy == own + connect
+        tags = re.sub(r"<(style|script)\b.*?</\1>", "", text, flags=re.S)
+        assert not re.search(r"<[^>]+\s(style|on\w+)=", tags)  # a hash covers no attribute
 
 
 def strip_of(text: str) -> list[tuple[str, str]]:
@@ -216,20 +236,38 @@ def test_any_two_moments_can_be_drawn(first: float, last: float) -> None:
             assert drawn["top"] <= y <= drawn["bottom"]
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("/photos/my fern", "my fern"),
-        ("D:\\photos\\fern", "fern"),
-        ("../../somebody/points.ply", "points.ply"),
-        ("~/photos/points.ply", "points.ply"),
-        ("~20 minutes", "~20 minutes"),
-        ("see /photos/mine/a.jpg.", "see a.jpg."),
-        ("PSNR/SSIM of a/b.png", "PSNR/SSIM of a/b.png"),
-    ],
-)
-def test_of_absolute_paths_the_last_name_is_shown(text: str, expected: str) -> None:
-    assert without_folders(text) == expected
+PATHS = {
+    "/photos/my fern": "my fern",
+    "D:\\photos\\fern": "fern",
+    "../../somebody/points.ply": "points.ply",
+    "~/photos/points.ply": "points.ply",
+    "/home/jane doe/x": "x",
+    "C:\\Users\\Jane Doe\\My Photos\\a.jpg": "a.jpg",
+    "\\\\server\\my share\\a.jpg": "a.jpg",
+    "/home/jane/Jane's photos/x y": "x y",
+}
+SENTENCES = {
+    "~20 minutes, or ~20/30": "~20 minutes, or ~20/30",
+    "see /photos/mine/a.jpg.": "see a.jpg.",
+    "PSNR/SSIM of a/b.png, and/or [dB]/c": "PSNR/SSIM of a/b.png, and/or [dB]/c",
+    "http://www.w3.org/2000/svg, 3 / 4 / 5 at f/2.8": "http://www.w3.org/2000/svg, 3 / 4 / 5 at f/2.8",
+    "/home/jane doe/My pictures/x.jpg: blurred and/or dark": "x.jpg: blurred and/or dark",
+    "C:\\Users\\Jane Doe\\a.jpg is one with C:/Users/Jane Doe/b.jpg": "a.jpg is one with b.jpg",
+    "no space left: '/home/jane doe/x.ply', nor in '../../jane doe/y'": "no space left: 'x.ply', nor in 'y'",
+    "/home/jane doe/out keeps its fit; this is in /home/jane doe/out/new, as": "out keeps its fit; this is in new, as",
+    "not /jane doe/a.jpg and images/b.jpg (~/jane doe/c)": "not a.jpg and images/b.jpg (c)",
+    "in /home/jane doe/ there": "in jane doe/ there",
+}
+
+
+def test_of_paths_outside_the_last_name_is_shown_whatever_blanks_their_folders_have() -> None:
+    for text, expected in {**PATHS, **SENTENCES}.items():
+        assert without_folders(text) == expected
+    assert facts({"a": [*PATHS, "/home/jane, doe/x"]}) == {"a": ", ".join([*PATHS.values(), "x"])}
+    begin = time.monotonic()
+    for part in ("/a b", "/", "a ", "\\x", "/a b.c", "../"):
+        without_folders("/" + part * 50_000)
+    assert time.monotonic() - begin < 5  # no text takes long
 
 
 def test_facts_are_simple_values_in_words() -> None:

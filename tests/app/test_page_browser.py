@@ -111,6 +111,20 @@ def test_it_loads_from_a_file_without_the_network_or_an_error(opened: Browser, p
     assert opened.problems == []
 
 
+def test_code_that_is_not_of_the_page_does_not_run(browser: Browser, page: Path, tmp_path: Path) -> None:
+    """A text that got into it: what the policy refuses is logged, and the page works as before."""
+    text = page.read_text(encoding="utf-8")
+    strange = "<script>window.ran = 1</script><img src='data:,' onerror='window.ran = 2'>"
+    strange += "<style>h1 { display: none }</style><p id='strange' style='display: none'>"
+    changed = tmp_path / "changed.html"
+    changed.write_text(text.replace("<main>", f"{strange}<main>"), encoding="utf-8")
+    browser.open(changed, READY)
+    assert browser.run("window.ran === undefined")
+    assert browser.run("['h1', '#strange'].every((name) => document.querySelector(name).checkVisibility())")
+    assert len(browser.problems) == 4
+    assert all("Content Security Policy" in problem for problem in browser.problems)
+
+
 def box(browser: Browser, selector: str = ".viewer canvas") -> Any:
     """Left, top, width and height of what a selector finds."""
     rectangle = f"document.querySelector('{selector}').getBoundingClientRect()"

@@ -23,16 +23,21 @@ _LEVELS = (
     (10.0, "recognisable, with large errors"),
     (-math.inf, "not the scene of the photos"),
 )
-# The folders of an absolute path inside a text.
-_FOLDERS = re.compile(r"(?<![\w.:/\\])(?:[A-Za-z]:)?[\\/](?:[^\\/\s]+[\\/])+(?=[^\\/\s])")
+# The folders of a path inside a sentence, if it is absolute or leads out of the folder. Their names may have blanks,
+# but not first or last, nor after what ends a path in a sentence: punctuation, or the ending of a file's name.
+_FOLDERS = re.compile(
+    r"""(?<![\w.:/\\~)\]}]) (?:[A-Za-z]: | ~(?:[A-Za-z_][\w.-]*)? | \.\.)? [\\/]+
+    (?: (?!\s) (?: (?! [,;:.)\]'"]\s | \.\w{1,5}\s | :[\\/] ) [^\\/\n] )+ (?<!\s) [\\/] )*
+    (?=[^\\/\s])""",
+    re.VERBOSE,
+)
 
 
-def without_folders(value: Any) -> str:
-    """The value as text in which paths that are absolute or lead out of the folder are shortened to their last part."""
-    text = str(value)
-    outside = text.startswith(("~", "../", "..\\"))
-    if outside or PurePosixPath(text).is_absolute() or PureWindowsPath(text).is_absolute():
-        return PureWindowsPath(text).name
+def without_folders(text: str) -> str:
+    """A sentence in which paths that are absolute or lead out of the folder are shortened to their last part.
+
+    In doubt, where a name with blanks could as well be words between two paths, too much is left out, not too little.
+    """
     return _FOLDERS.sub("", text)
 
 
@@ -113,7 +118,13 @@ def _as_text(value: Any) -> str:
         return "none"
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return f"{value:.6g}" if isinstance(value, float) else without_folders(value)
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    text = str(value)
+    is_outside = text.startswith(("~/", "~\\", "../", "..\\"))
+    if is_outside or PurePosixPath(text).is_absolute() or PureWindowsPath(text).is_absolute():
+        return PureWindowsPath(text).name  # all of it is a path
+    return without_folders(text)
 
 
 def psnr_of_views(metrics: Mapping[str, Any]) -> dict[str, float]:

@@ -2,8 +2,9 @@
 
 import base64
 import gzip
+import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -27,19 +28,9 @@ _THUMBNAIL_BYTES = 100_000  # of all thumbnails
 _LAYOUT_BYTES = 8192  # reserved for the layout of the splat and for sizes in the text
 _NUMBERS = ("One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine", "Ten", "Eleven", "Twelve")
 _LISTED = 24  # photos whose file names are under Details
-_FILES = [
-    "style.css",
-    "viewer.css",
-    "renderer.js",
-    "ruler.js",
-    "viewer.js",
-    "pictures.js",
-    "live.js",
-    "splat.vert.glsl",
-    "splat.frag.glsl",
-    "screen.vert.glsl",
-    "screen.frag.glsl",
-]
+_STYLES = ("style.css", "viewer.css")
+_SCRIPTS = ("renderer.js", "ruler.js", "viewer.js")
+_SHADERS = ("splat.vert.glsl", "splat.frag.glsl", "screen.vert.glsl", "screen.frag.glsl")
 
 
 def write_page(path: Path, content: PageContent, max_bytes: int = MAX_BYTES) -> str:
@@ -82,14 +73,24 @@ def live_html(content: PageContent) -> bytes:
     Cameras and lenses are those of `content`, whose Gaussians only say where the scene is.
     """
     no_splat = Packed({"count": 0, "degree": 0, "columns": []}, gzip.compress(b""))
-    return _Page(content, "live.html.jinja").html(no_splat)
+    return _Page(content, "live.html.jinja", "live.js").html(no_splat)
 
 
 class _Page:
-    """Makes the HTML of a page, first without its splat, which is packed into what the rest leaves."""
+    """Makes the HTML of a page, first without its splat, which is packed into what the rest leaves.
 
-    def __init__(self, content: PageContent, template: str = "page.html.jinja") -> None:
+    Its policy (CSP) names the one script and the one style sheet by their SHA-256. The browser runs and applies no
+    other, should a text of the user ever get into the page as code; so elements have no style attributes.
+
+    Args:
+        content: what the page shows.
+        template: a file of this folder.
+        script: the file of this folder that follows the scripts of the viewer.
+    """
+
+    def __init__(self, content: PageContent, template: str = "page.html.jinja", script: str = "pictures.js") -> None:
         import jinja2
+        from markupsafe import Markup
 
         runs = list(content.text.runs.values())
         scene = viewer_scene(
@@ -103,6 +104,13 @@ class _Page:
         self._scene = scene | {"offset": [0.0, 0.0, 0.0] if offset is None else offset.tolist()}
         self._settings = _viewer_settings(content.splat, content.photos)
         self._context = _context(content, self._scene)
+        code = {
+            "style": "".join([*map(_file, _STYLES), *_sizes(self._scene, self._context["strip"])]),
+            "script": "".join(map(_file, (*_SCRIPTS, script))),
+        }
+        for kind, text in code.items():
+            digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+            self._context |= {kind: Markup(text), f"{kind}_hash": f"sha256-{digest}"}
         loader = jinja2.PackageLoader("kgs.app.page", ".")
         environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True)
         self._template = environment.get_template(template)
@@ -139,17 +147,14 @@ def _context(content: PageContent, scene: Mapping[str, Any]) -> dict[str, Any]:
     photos = content.photos
     text = content.text
     cameras = scene["cameras"]
-    width, height = cameras[scene["first"]]["size"]
     first_run = next(iter(text.runs.values()), {})
     measures_head, measures = measure_table(text.runs)
-    folder = resources.files("kgs.app.page")
     return {
         "title": text.title,
         "lead": f"{_in_words(len(cameras))}. Drag to look around.",
         "strip": _strip(photos, cameras),
         "has_photos": bool(photos.pictures or photos.thumbnails),
         "version": __version__,
-        "aspect": f"{width} / {height}",
         "scene": scene,
         "verdict": verdict(text.runs),
         "notes": [without_folders(note) for note in text.notes],
@@ -165,8 +170,22 @@ def _context(content: PageContent, scene: Mapping[str, Any]) -> dict[str, Any]:
         "left_out": without_folders(text.left_out),
         "settings": facts(text.settings),
         "versions": facts(first_run.get("versions") or {"kgs": __version__}),
-        "files": {name: Markup(folder.joinpath(name).read_text(encoding="utf-8")) for name in _FILES},
+        "files": {name: Markup(_file(name)) for name in _SHADERS},
     }
+
+
+def _file(name: str) -> str:
+    """The text of a file of this folder."""
+    return resources.files("kgs.app.page").joinpath(name).read_text(encoding="utf-8")
+
+
+def _sizes(scene: Mapping[str, Any], strip: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Rules for the aspect ratio of the stage, that of the first view, and for the sizes of the thumbnails."""
+    width, height = scene["cameras"][scene["first"]]["size"]
+    yield f":root {{ --aspect: {width} / {height} }}\n"
+    for one in strip:
+        if "photo" in one:
+            yield f'[data-camera="{one["index"]}"] {{ --width: {one["width"]}; --height: {one["height"]} }}\n'
 
 
 def _strip(photos: PagePhotos, cameras: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
