@@ -28,6 +28,14 @@ def check_device(name: str) -> torch.device:
     return device
 
 
+def device_name(device: torch.device) -> str:
+    """What a user knows a device as: "CPU, 2 cores", of which torch uses so many, or the name of a GPU."""
+    if device.type == "cpu":
+        cores = torch.get_num_threads()
+        return f"CPU, {cores} core{'s' if cores > 1 else ''}"
+    return f"{torch.get_device_module(device).get_device_name(device)} ({device})"
+
+
 def check_packages(*packages: str) -> None:
     """Raises if a package that a command needs is missing."""
     for package in packages:

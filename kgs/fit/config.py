@@ -118,7 +118,8 @@ class FitConfig:
     `fit_scene` and the command use all entries. A `Trainer` is given its initial points and removes nothing after the
     last step: it ignores init, init_file, init_points, draw and prune. Unless :func:`kgs.fit.run.decide` was asked,
     it takes a `sh_degree` of None as 0, a `drop` of None as 0.3, a `steps` of None as 1100 with more than three views,
-    and all photos as equally exposed. :mod:`kgs.fit.overlap` has the numbers of steps and drop.
+    and all photos as equally exposed. :mod:`kgs.fit.overlap` has the numbers of steps and drop. Only the command takes
+    the device auto, its default: a GPU if kgs has kernels for it that pass their check, else the CPU.
 
     Args:
         steps: number of training steps, to which the recipe's counts are scaled. Unless given: 900 for up to three
@@ -154,7 +155,7 @@ class FitConfig:
         prune: whether Gaussians that no training view shows are removed, and harmonics that change no image.
         max_bytes: bound on the working memory of a render, in bytes; it changes results only by rounding.
         evaluations: how often the PSNR curve is measured, the last time at the end.
-        device: cpu, cuda, cuda:1, ...
+        device: cpu, cuda, ... auto: a GPU if one is of use.
         backend: numba: compiled, several times faster than torch, only on a CPU. triton: compiled, only on a GPU. auto:
             the one of these that is installed, else torch.
         recipe: all other numbers, a `kgs.fit.config.Recipe`.

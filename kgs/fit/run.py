@@ -73,6 +73,7 @@ def choose_points(scene: Scene, config: FitConfig, bar: ProgressBar = silent) ->
         return InitialPoints(scene.points, scene.point_colors, scene.init_kind)
     views = scene.train if scene.train_full_size is None else scene.train_full_size
     options: dict[str, Any] = {
+        "device": config.device,
         "seed": config.seed,
         "count": config.init_points,
         "draw": config.draw,

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from kgs._support.errors import ArgumentError, warn
+from kgs._support.machine import check_device
 from kgs._support.progress import ProgressBar, silent
 from kgs.datasets.scene import Views
 from kgs.geometry import ViewGeometry
@@ -57,6 +58,7 @@ def initial_points(
     bar: ProgressBar = silent,
     backend: str = "auto",
     draw: str = "uniform",
+    device: torch.device | str = "cpu",
 ) -> InitialPoints:
     """Find the points that a fit starts from.
 
@@ -81,13 +83,14 @@ def initial_points(
         bar: wraps the loops to show their progress, see :mod:`kgs._support.progress`.
         backend: one of :func:`kgs.backends.available`, for "dense" and "sift".
         draw: how "dense" points are drawn: "uniform", or "spread" evenly over the images.
+        device: where the depth maps of "dense" are made: on a GPU by torch. The points are on the CPU.
 
     Returns:
         The points. `kind` says what they are: "random" if "sift" was asked for and found too few.
 
     Raises:
         TypeError: `views` is not a `Views`; a whole scene, for instance.
-        ValueError: another kind or draw, `count` below 1, or no file for "file".
+        ValueError: another kind or draw, `count` below 1, no file for "file", or a device that cannot be used.
         DataError: the file is missing, broken, compressed, too large, or has no points.
     """
     check_kind("views", views, Views)
@@ -97,6 +100,7 @@ def initial_points(
         raise ArgumentError(f"draw: expected one of {list(DRAWS)}, got {draw!r}")
     if count is not None and count < 1:
         raise ArgumentError(f"count: expected at least 1, got {count}")
+    where = check_device(str(device))
     if kind == "file":
         if file is None:
             raise ArgumentError("file: expected a path for the kind 'file', got None")
@@ -106,7 +110,7 @@ def initial_points(
     generator = torch.Generator().manual_seed(seed)
     if kind == "dense":
         near, far = sweep_range(tracked, geometry)
-        dense = dense_points(views, near, far, count, generator, bar, backend, draw, pixels)
+        dense = dense_points(views, near, far, count, generator, bar, backend, draw, pixels, where)
         if dense.agreed >= (MIN_DENSE if count is None else min(MIN_DENSE, count)):
             return InitialPoints(dense.points, dense.colors, kind, dense.patches, dense.views)
         message = (

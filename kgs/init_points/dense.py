@@ -58,6 +58,7 @@ def dense_points(
     backend: str = "auto",
     draw: str = "uniform",
     pixels: int | None = None,
+    device: torch.device | None = None,
 ) -> DensePoints:
     """At most `count` points on which two views agree, drawn at random.
 
@@ -67,11 +68,11 @@ def dense_points(
     `MAX_POINTS` (`MAX_POINTS_FEW_VIEWS`), in images that have together `pixels` pixels, or those of the views.
 
     `draw` is "uniform", or "spread" evenly over the images: one point from each of about as many cells. Points lie
-    where the pixels of both views are usable.
+    where the pixels of both views are usable. Depth maps are made on `device`, None for a CPU; points are on the CPU.
     """
     pixels = pixels or views.images[:, 0].numel()
     views = small_enough(views, near, far)
-    maps, certain = agreed_depths(views, near, far, bar, backend)
+    maps, certain = agreed_depths(views, near, far, bar, backend, device)
     geometry = ViewGeometry.of(views.cameras)
     parts = [_agreed(views, geometry, maps, certain, view) for view in range(len(views))]
     points, colors, view_pixels = map(torch.cat, zip(*parts, strict=True))
@@ -102,10 +103,15 @@ def small_enough(views: Views, near: float, far: float) -> Views:
 
 
 def agreed_depths(
-    views: Views, near: float, far: float, bar: ProgressBar = silent, backend: str = "auto"
+    views: Views,
+    near: float,
+    far: float,
+    bar: ProgressBar = silent,
+    backend: str = "auto",
+    device: torch.device | None = None,
 ) -> tuple[list[DepthMap], list[Tensor]]:
     """The depth maps of the views, averaged, and the pixels that count: inside, usable and well matched."""
-    maps = sweep_depths(views, near, far, bar, backend)
+    maps = sweep_depths(views, near, far, bar, backend, device)
     certain = [depth_map.is_inner & (depth_map.scores > SCORE) for depth_map in maps]
     usable = views.usable
     if usable is not None:

@@ -41,6 +41,7 @@ def sweep_depths(
     far: float,
     bar: ProgressBar = silent,
     backend: str = "auto",
+    device: torch.device | None = None,
 ) -> list[DepthMap]:
     """The depth map of each view, from planes evenly spread over inverse depth, from a depth to infinity.
 
@@ -49,25 +50,28 @@ def sweep_depths(
     `MAX_TO_INFINITY`, else farther apart. Depths are at most `FARTHEST` times `far`.
 
     If all other views are at the centre of a view, its depths are unknown and its scores -1.
+
+    The sweep runs on `device`, None for a CPU; its results are on the CPU.
     """
     if not 0 < near < far < math.inf:
         raise ArgumentError(f"near, far: expected 0 < near < far, got {near} and {far}")
-    grey = rgb_to_grayscale(views.images.cpu().float())[:, 0]
+    device = torch.device("cpu") if device is None else device
+    grey = rgb_to_grayscale(views.images.to(device).float())[:, 0]
     planes = plane_count(planes_wanted(views, near, far))
     typical = 2 / (1 / near + 1 / far)
     spacing = max((1 / near - 1 / far) / (planes - 1), 1 / near / (MAX_TO_INFINITY - 2))
-    inverse = 1 / near - spacing * torch.arange(math.ceil(1 / near / spacing) + 2, dtype=torch.float64)
+    inverse = 1 / near - spacing * torch.arange(math.ceil(1 / near / spacing) + 2, dtype=torch.float64, device="cpu")
     geometry = ViewGeometry.of(views.cameras)
-    memory = torch.empty(2, *grey.shape[1:], len(inverse))
+    memory = grey.new_empty(2, *grey.shape[1:], len(inverse)) if device.type == "cpu" else None
     maps = []
     for view in bar(range(len(views)), "depth maps", "view"):
         others = _neighbours(geometry, view, typical)
         if others:
             homographies = torch.stack([_homographies(geometry, view, other, inverse) for other in others])
-            costs, unsmoothed = sweep_costs(grey[view], grey[others], homographies, backend, memory)
+            costs, unsmoothed = sweep_costs(grey[view], grey[others], homographies.to(device), backend, memory)
             maps.append(_refine(costs, unsmoothed, inverse, FARTHEST * far))
         else:
-            unknown = torch.full_like(grey[view], -1.0)
+            unknown = torch.full_like(grey[view], -1.0, device="cpu")
             maps.append(DepthMap(torch.full_like(unknown, far), unknown, unknown > 0))
     return maps
 
@@ -79,9 +83,9 @@ def plane_count(wanted: float) -> int:
 
 def planes_wanted(views: Views, near: float, far: float) -> float:
     """By how many pixels the middle of a view moves in a neighbour from one depth to the other: the median."""
-    inverse = torch.linspace(1 / near, 1 / far, PLANES, dtype=torch.float64)
-    middle = torch.tensor([views.images.shape[-1] / 2, views.images.shape[-2] / 2, 1.0], dtype=torch.float64)
     geometry = ViewGeometry.of(views.cameras)
+    inverse = torch.linspace(1 / near, 1 / far, PLANES, dtype=torch.float64, device="cpu")
+    middle = inverse.new_tensor([views.images.shape[-1] / 2, views.images.shape[-2] / 2, 1.0])
     steps = []
     for view in range(len(views)):
         for other in _neighbours(geometry, view, 1 / float(inverse.mean())):
@@ -111,7 +115,7 @@ def _homographies(geometry: ViewGeometry, view: int, other: int, inverse: Tensor
 def _refine(cost: Tensor, unsmoothed: Tensor, inverse: Tensor, max_depth: float) -> DepthMap:
     """The depth of the cheapest plane of each pixel, refined by the lowest point of a parabola through three planes.
 
-    It is at most `max_depth`, also where the inverse depth is 0 or below.
+    It is at most `max_depth`, also where the inverse depth is 0 or below. The map is on the CPU.
     """
     best = cost.argmin(0)
     inner = best.clamp(1, len(cost) - 2)
@@ -121,4 +125,6 @@ def _refine(cost: Tensor, unsmoothed: Tensor, inverse: Tensor, max_depth: float)
     bend = left - 2 * middle + right
     offset = torch.where(bend > 1e-9, 0.5 * (left - right) / bend.clamp_min(1e-9), 0.0).clamp(-0.5, 0.5)
     depths = 1.0 / (float(inverse[0]) + (inner + offset) * float(inverse[1] - inverse[0])).clamp_min(1.0 / max_depth)
-    return DepthMap(depths, 1.0 - unsmoothed.gather(0, best[None])[0], (best > 0) & (best < len(cost) - 1))
+    scores = 1.0 - unsmoothed.gather(0, best[None])[0]
+    is_inner = (best > 0) & (best < len(cost) - 1)
+    return DepthMap(depths.cpu(), scores.cpu(), is_inner.cpu())

@@ -20,8 +20,7 @@ MIN_JUMP = 1.5 * STEP
 UNSEEN = 0.3  # the score where no neighbour shows the patch; noise reaches as much
 ALONE = 0.6  # the second best score where one neighbour shows it, over that one's
 MARGIN = 1e-3  # pixels by which a point may lie outside an image: rounding of the homography
-# Quarter turns that lead each direction of the smoothing down, and its columns per row, in the order of the kernels
-DIRECTIONS = ((1, 1), (0, 0), (0, 1), (2, 1), (2, 0), (3, 1), (3, 0), (1, 0))
+PLANES_AT_ONCE = 8  # that torch compares: few, for memory, and enough that a GPU does not wait for their launches
 VARIANCE = 1e-5  # added to that of a patch, in squared grey values, so that noise on flat surfaces does not match
 
 
@@ -31,10 +30,10 @@ def sweep_costs(
     """Smoothed costs of each plane and pixel, and the costs before, 1 minus the scores; each `(D, H, W)`.
 
     Args:
-        image: grey, float32 on a CPU, `(H, W)`.
-        others: images of the neighbours, `(N, H, W)`.
+        image: grey, float32, `(H, W)`.
+        others: images of the neighbours, `(N, H, W)`, on its device, as all that follow.
         homographies: from pixels of `image` to those of a neighbour, by planes, float64, `(N, D, 3, 3)`.
-        backend: "numba" and "auto" use kernels if possible.
+        backend: "numba" and "auto" use kernels if possible: on a CPU.
         memory: float32 `(2, H, W, D)`, for the results of kernels, which is faster than new memory for each view.
     """
     middle = image.mean()  # without it, sums over windows are more exact
@@ -44,7 +43,8 @@ def sweep_costs(
         memory = torch.empty(2, *image.shape, homographies.shape[1]) if memory is None else memory
         return _compiled_costs(image, others, homographies, *memory)
     moments = _moments(image)
-    costs = torch.stack([_plane_costs(image, moments, others, plane) for plane in homographies.unbind(1)])
+    groups = homographies.split(PLANES_AT_ONCE, 1)
+    costs = torch.cat([_plane_costs(image, moments, others, planes) for planes in groups])
     return _semi_global(costs, image), costs
 
 
@@ -67,7 +67,7 @@ def _compiled_costs(
 
 
 def _plane_costs(image: Tensor, moments: tuple[Tensor, Tensor], others: Tensor, homographies: Tensor) -> Tensor:
-    """1 minus the scores of the pixels on one plane, `(H, W)`.
+    """1 minus the scores of the pixels on D planes, `(D, H, W)`.
 
     Three quarters of the best neighbour's score and a quarter of the second best's: others may not see the patch.
     """
@@ -79,34 +79,47 @@ def _plane_costs(image: Tensor, moments: tuple[Tensor, Tensor], others: Tensor, 
     return 1.0 - torch.where(best > -torch.inf, best, UNSEEN)
 
 
-def _correlations(image: Tensor, moments: tuple[Tensor, Tensor], other: Tensor, homography: Tensor) -> Tensor:
-    """NCC of the patch around each pixel, `(H, W)`; -inf where the patch leaves the other image."""
+def _correlations(image: Tensor, moments: tuple[Tensor, Tensor], other: Tensor, homographies: Tensor) -> Tensor:
+    """NCC of the patch around each pixel, `(D, H, W)`; -inf where the patch leaves the other image."""
     mean, variance = moments
-    warped, inside = warp(other, homography)
+    warped, inside = warp(other, homographies)
     warped_mean, warped_variance = _moments(warped)
     covariance = _box(image.double() * warped) - mean * warped_mean
     scores = covariance * ((variance + VARIANCE) * (warped_variance + VARIANCE)).rsqrt()
     return torch.where(_box(inside.float()) > 0.99, scores, -torch.inf).float()
 
 
-def warp(image: Tensor, homography: Tensor) -> tuple[Tensor, Tensor]:
-    """The image at the points to which a homography maps pixels, and whether these lie in the image; both `(H, W)`."""
+def warp(image: Tensor, homographies: Tensor) -> tuple[Tensor, Tensor]:
+    """The image at the points to which D homographies map pixels, and whether these lie in it; both `(D, H, W)`."""
     height, width = image.shape
-    last = torch.tensor([width - 1, height - 1], dtype=torch.float64)
-    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    mapped = torch.stack([columns, rows, torch.ones_like(rows)], -1).double() @ homography.mT
+    columns = torch.arange(width, dtype=torch.float64, device=image.device).expand(height, width)
+    rows = torch.arange(height, dtype=torch.float64, device=image.device)[:, None].expand(height, width)
+    pixels = torch.stack([columns, rows, torch.ones_like(rows)], -1).reshape(-1, 3)
+    mapped = (pixels @ homographies.mT).reshape(-1, height, width, 3)
     points = mapped[..., :2] / mapped[..., 2:]
+    last = pixels[-1, :2]
     inside = ((points >= -MARGIN) & (points <= last + MARGIN)).all(-1) & (mapped[..., 2] > 0)
     grid = torch.where(inside[..., None], 2 * points / last - 1, 0.0)
-    warped = torch.nn.functional.grid_sample(
-        image[None, None].double(), grid[None], padding_mode="border", align_corners=True
-    )
-    return torch.where(inside, warped[0, 0].float(), 0.0), inside
+    source = image.double().expand(len(grid), 1, height, width)
+    warped = torch.nn.functional.grid_sample(source, grid, padding_mode="border", align_corners=True)[:, 0]
+    return torch.where(inside, warped.float(), 0.0), inside
 
 
-def _box(image: Tensor) -> Tensor:
-    """The mean over the window around each pixel."""
-    return torch.from_numpy(cv2.blur(image.numpy(), (WINDOW, WINDOW), borderType=cv2.BORDER_REPLICATE))
+def _box(images: Tensor) -> Tensor:
+    """The mean over the window around each pixel of some images, `(..., H, W)`."""
+    flat = images.reshape(-1, *images.shape[-2:])
+    if images.device.type == "cpu":
+        border = cv2.BORDER_REPLICATE
+        means = [torch.from_numpy(cv2.blur(image.numpy(), (WINDOW, WINDOW), borderType=border)) for image in flat]
+        return torch.stack(means).reshape(images.shape)
+    return _pooled(flat).reshape(images.shape)
+
+
+def _pooled(images: Tensor) -> Tensor:
+    """What OpenCV's blur returns, of images `(B, H, W)`."""
+    padded = torch.nn.functional.pad(images[:, None], [WINDOW // 2] * 4, mode="replicate")
+    of_columns = torch.nn.functional.avg_pool2d(padded, (WINDOW, 1), stride=1)
+    return torch.nn.functional.avg_pool2d(of_columns, (1, WINDOW), stride=1)[:, 0]
 
 
 def _moments(image: Tensor) -> tuple[Tensor, Tensor]:
@@ -119,21 +132,45 @@ def _moments(image: Tensor) -> tuple[Tensor, Tensor]:
 def _semi_global(cost: Tensor, grey: Tensor) -> Tensor:
     """The sum of the costs of the cheapest paths along eight directions, `(D, H, W)`."""
     total = torch.zeros_like(cost)
-    for turns, slant in DIRECTIONS:
-        total += _path_costs(cost.rot90(turns, (1, 2)), grey.rot90(turns), slant).rot90(-turns, (1, 2))
-    return total
+    rows = range(cost.shape[1])
+    _add_paths(total, cost, grey, rows, (-1, 0, 1))
+    _add_paths(total, cost, grey, rows[::-1], (-1, 0, 1))
+    total = total.mT.contiguous()
+    cost = cost.mT.contiguous()
+    columns = range(cost.shape[1])
+    _add_paths(total, cost, grey.mT, columns, (0,))
+    _add_paths(total, cost, grey.mT, columns[::-1], (0,))
+    return total.mT.contiguous()
 
 
-def _path_costs(cost: Tensor, grey: Tensor, slant: int) -> Tensor:
-    """Costs of the cheapest paths that come down row by row, `slant` columns to the right per row, `(D, H, W)`."""
-    paths = cost.clone()
-    end = cost.shape[2] - slant
-    for row in range(1, cost.shape[1]):  # of the first row, and at the side, paths begin
-        before = paths[:, row - 1, :end]
-        lowest = before.amin(0)
-        edge = (grey[row, slant:] - grey[row - 1, :end]).abs()
-        cheapest = torch.minimum(before, lowest + (JUMP * EDGE / (EDGE + edge)).clamp_min(MIN_JUMP))
-        cheapest[1:] = torch.minimum(cheapest[1:], before[:-1] + STEP)
-        cheapest[:-1] = torch.minimum(cheapest[:-1], before[1:] + STEP)
-        paths[:, row, slant:] += cheapest - lowest
-    return paths
+def _add_paths(total: Tensor, cost: Tensor, grey: Tensor, rows: range, slants: tuple[int, ...]) -> None:
+    """Add the costs of the cheapest paths that go through these rows, `slants` columns to the right per row.
+
+    Args:
+        total: where costs are added, `(D, H, W)`.
+        cost: of each plane and pixel, `(D, H, W)`.
+        grey: the image, `(H, W)`, whose edges make jumps cheaper.
+        rows: in the order of the paths, beside each other.
+        slants: consecutive numbers, at most 1; paths of all of them go side by side.
+    """
+    planes, _, width = cost.shape
+    # The row before, between columns from which no path comes: of costs 0, as before the first row. Beside the first
+    # and last plane there is none to step from.
+    before = cost.new_full((len(slants), planes + 2, width + 2), torch.inf)
+    before[:, 1:-1] = 0.0
+    left, step, column = before.stride()
+    shifted = before.as_strided((len(slants), planes + 2, width), (left - 1, step, column), 1 - slants[0])
+    beside = torch.nn.functional.pad(grey[None], (1, 1), mode="replicate")[0]
+    neighbours = torch.stack([beside[:, 1 - slant : 1 - slant + width] for slant in slants], 1)
+    order = torch.tensor(rows, device=grey.device)
+    edges = (grey[order, None] - neighbours[order.roll(1)]).abs()
+    jumps = (JUMP * EDGE / (EDGE + edges)).clamp_min(MIN_JUMP)
+    for row, jump in zip(rows, jumps, strict=True):
+        here = shifted[:, 1:-1]
+        lowest = here.amin(1, keepdim=True)
+        cheapest = torch.minimum(here, lowest + jump[:, None])
+        cheapest = torch.minimum(cheapest, torch.minimum(shifted[:, :-2], shifted[:, 2:]) + STEP)
+        paths = cheapest.sub_(lowest).add_(cost[:, row])
+        before[:, 1:-1, 1:-1] = paths
+        for path in paths:
+            total[:, row] += path

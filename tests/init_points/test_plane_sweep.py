@@ -4,6 +4,7 @@ import re
 
 import pytest
 import torch
+from factories import other_defaults
 from kernel_checks import avx_assembly, check_bits
 from torch.nn.functional import grid_sample, pad
 
@@ -93,7 +94,7 @@ def test_a_warped_ramp_is_a_ramp_and_empty_behind_the_camera(last_row):
     u, v = x / z, y / z
     expected = (z > 0) & (u >= 0) & (u <= 29) & (v >= 0) & (v <= 19)
     assert expected.any()
-    warped, inside = sweep_costs_module.warp(ramp, homography)
+    (warped,), (inside,) = sweep_costs_module.warp(ramp, homography[None])
     assert torch.equal(inside, expected)
     torch.testing.assert_close(warped, (0.2 + 0.01 * u + 0.02 * v).where(expected, 0).float(), rtol=0, atol=1e-5)
 
@@ -106,6 +107,59 @@ def test_depth_maps_are_torchs(count):
         same = (results.depths / expected.depths - 1).abs() < 1e-4
         assert float(same.double().mean()) > 0.999
         assert float((results.scores - expected.scores)[same].abs().max()) < 1e-5
+
+
+def boxes(images):
+    """What `_box` does on a GPU."""
+    return sweep_costs_module._pooled(images.reshape(-1, *images.shape[-2:])).reshape(images.shape)
+
+
+@pytest.mark.parametrize("size", [(7, 9), (1, 20), (3, 2), (40, 61)])
+def test_windows_on_a_gpu_have_the_means_of_opencv(size):
+    images = torch.rand(2, 3, *size, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    torch.testing.assert_close(boxes(images), sweep_costs_module._box(images), rtol=1e-12, atol=1e-14)
+
+
+def test_depth_maps_as_a_gpu_makes_them_are_those_of_the_kernels(monkeypatch):
+    views = synthetic_scene(train_views=2, test_views=1, size=(48, 64), seed=0).train
+    expected = plane_sweep.sweep_depths(views, 2.0, 20.0, backend="numba")
+    monkeypatch.setattr(sweep_costs_module, "_box", boxes)
+    results = plane_sweep.sweep_depths(views, 2.0, 20.0, backend="torch")
+    for one, other in zip(results, expected, strict=True):
+        same = (one.depths / other.depths - 1).abs() < 1e-4
+        assert float(same.double().mean()) > 0.999
+        assert float((one.scores - other.scores)[same].abs().max()) < 1e-5
+
+
+@pytest.mark.parametrize("backend", ["auto", "torch", "triton"])
+def test_a_sweep_stays_on_its_device_and_its_maps_are_on_the_cpu(monkeypatch, backend):
+    """The meta device stands for a GPU: an operator that gets tensors of both raises an error."""
+    fetched = []
+
+    def cpu(tensor):
+        fetched.append(tensor.device.type)
+        return torch.zeros_like(tensor, device="cpu")
+
+    monkeypatch.setattr("kgs.backends.check_backend", lambda _: None)  # triton need not be installed
+    views = synthetic_scene(train_views=3, test_views=1, size=(24, 32), seed=0).train
+    to_cpu = torch.Tensor.cpu
+    monkeypatch.setattr(torch.Tensor, "cpu", lambda x: cpu(x) if x.is_meta else to_cpu(x))
+    maps = plane_sweep.sweep_depths(views, 2.0, 20.0, backend=backend, device=torch.device("meta"))
+    assert len(maps) == len(views)
+    for depth_map in maps:
+        for values in vars(depth_map).values():
+            assert (values.device.type, values.shape) == ("cpu", views.images.shape[-2:])
+    assert fetched == ["meta"] * 3 * len(views)
+
+
+def test_a_sweep_is_the_same_under_another_default_device_and_dtype():
+    views = synthetic_scene(train_views=2, test_views=1, size=(24, 32), seed=0).train
+    for backend in ("numba", "torch"):
+        expected = plane_sweep.sweep_depths(views, 2.0, 20.0, backend=backend)
+        with other_defaults():
+            results = plane_sweep.sweep_depths(views, 2.0, 20.0, backend=backend)
+        for one, other in zip(results, expected, strict=True):
+            assert all(torch.equal(value, vars(other)[name]) for name, value in vars(one).items())
 
 
 def test_bits_depend_neither_on_threads_nor_on_repetition():

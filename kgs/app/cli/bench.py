@@ -6,7 +6,7 @@ from .options import Out
 from .tools import check_installed, load_tools
 
 
-def speed(*, out: Out, quick: bool = False, device: str = "cpu") -> None:
+def speed(*, out: Out, quick: bool = False, device: str = "auto") -> None:
     """Measure time and memory of renders and training steps with torch and numba.
 
     For example:
@@ -18,16 +18,16 @@ def speed(*, out: Out, quick: bool = False, device: str = "cpu") -> None:
     Args:
         out: folder for the results, created if it does not exist.
         quick: fewer Gaussians and repetitions.
-        device: where to render: cpu, cuda, cuda:1, ...
+        device: auto: a GPU if kgs has kernels for it, else the CPU. Or cpu, cuda, cuda:1, ...
     """
     check_installed("matplotlib")
-    _begin(out, "speed", "scaling.png", device=device)
+    found = _begin(out, "speed", "scaling.png", device=device)
 
     from kgs.app.files.publishing import replacing
     from kgs.bench.speed import speed
 
     with replacing(out, "bench speed") as new:
-        speed(out=new, quick=quick, device=device)
+        speed(out=new, quick=quick, device=found)
 
 
 def precision(*, out: Out, quick: bool = False) -> None:
@@ -74,11 +74,11 @@ def extremes(*, out: Out) -> int:
         return extremes(out=new)
 
 
-def _begin(out: Path, name: str, *pictures: str, device: str = "cpu") -> None:
-    """Check the folder of a benchmark, which writes three files of its name and pictures; then load torch."""
+def _begin(out: Path, name: str, *pictures: str, device: str = "cpu") -> str:
+    """Check the folder of a benchmark, which writes files of its name and pictures; load torch, and name the device."""
     from kgs.app.files.outputs import check_folder
     from kgs.app.files.publishing import check_free
 
     check_folder(out, make=False)
     check_free(out, f"bench {name}", (f"{name}.csv", f"{name}.json", f"{name}.md", *pictures))
-    load_tools(device)
+    return str(load_tools(device))

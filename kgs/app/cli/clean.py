@@ -30,7 +30,7 @@ def clean(
     cameras: IfGiven[Path] = None,
     downscale: IfGiven[float] = None,
     background: Background = "black",
-    device: str = "cpu",
+    device: str = "auto",
     backend: Backend = "auto",
 ) -> None:
     """Remove floaters, giants and needles from a splat: what shows from beside the photos alone.
@@ -51,7 +51,7 @@ def clean(
             given, floaters are the isolated ones alone, and no photo is compared.
         downscale: with --cameras, reduce the photos by this factor.
         background: with --cameras, the colour behind the splat, and behind photos with transparency.
-        device: cpu, cuda, ...
+        device: auto: a GPU if kgs has kernels for it, else the CPU. Or cpu, cuda, cuda:1, ...
         backend: auto: that of the fit, or the fastest that is installed. kgs fit --help-all describes the others.
     """
     from kgs.datasets.options import check_options
@@ -80,7 +80,7 @@ def clean(
     check_strength(strength)
     fit = None
     if splat.is_dir():
-        request, fit = load_fit(splat, device, backend, say)
+        request, fit = load_fit(splat, torch_device, backend, say)
         downscale = request.shrink(fit.scene)
         background = "white" if request.background == "white" else "black"
     elif source is not None:

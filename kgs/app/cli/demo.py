@@ -31,7 +31,7 @@ def demo(
     size: tuple[int, int] = (378, 504),
     compare: bool = False,
     seed: int = 0,
-    device: str = "cpu",
+    device: str = "auto",
     backend: Backend = "auto",
 ) -> None:
     """Fit six photos of bananas, and measure the fit on two held-out photos.
@@ -50,7 +50,7 @@ def demo(
         compare: fit a second time without DropGaussian, from the same initial points. For most seeds the two differ
             little.
         seed: of everything random: the room, the initial points and the fits.
-        device: cpu, cuda, ...
+        device: auto: a GPU if kgs has kernels for it, else the CPU. Or cpu, cuda, cuda:1, ...
         backend: auto: the fastest that is installed. kgs fit --help-all describes the others.
     """
     from kgs.app.files.outputs import check_folder
@@ -58,12 +58,16 @@ def demo(
     from kgs.app.files.results_folder import SPLAT_FILES
 
     preset = ROOM_DEMO if scene == "room" else DEMO
-    config = replace(preset, seed=seed, steps=steps, device=device, backend=backend)
+    config = replace(preset, seed=seed, steps=steps, backend=backend)
     check_size(scene, size)
     check_folder(out, make=False)
     check_free(out, "demo", (*SPLAT_FILES, "metrics.json", "curve.png", "demo.png"))
-    load_tools(device, backend, "jinja2")
+    found = load_tools(device, backend, "jinja2")
 
+    from kgs._support.machine import device_name
+
+    say(f"device: {device_name(found)}")
+    config = replace(config, device=str(found))
     drops = {"without": 0.0, "with": DROP} if compare else {"with": DROP}
     notes = [CREDIT] if scene == "bananas" else []
     runs = run_demo(load_demo(scene, size, seed), config, out, drops, notes)

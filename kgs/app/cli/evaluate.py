@@ -12,7 +12,7 @@ from .tools import load_tools
 
 
 def evaluate(
-    out: Path, /, *, lpips_weights: IfGiven[Path] = None, device: str = "cpu", backend: Backend = "auto"
+    out: Path, /, *, lpips_weights: IfGiven[Path] = None, device: str = "auto", backend: Backend = "auto"
 ) -> None:
     """Measure a fit again, and update its metrics.json and its page.
 
@@ -25,7 +25,7 @@ def evaluate(
     Args:
         out: the folder of the results of kgs fit.
         lpips_weights: folder with the weights of VGG16 and LPIPS (npz). Unless given: LPIPS is not measured.
-        device: cpu, cuda, ...
+        device: auto: a GPU if kgs has kernels for it, else the CPU. Or cpu, cuda, cuda:1, ...
         backend: auto: that of the fit. kgs fit --help-all describes the others.
     """
     from kgs.app.files.locks import locked
@@ -43,7 +43,7 @@ def _evaluate(out: Path, lpips_weights: Path | None, device: str, backend: Backe
     from kgs.app.files.publishing import check_free, replacing
 
     check_free(out, "fit", ("metrics.json", "index.html"))
-    load_tools(device, backend, "jinja2")
+    torch_device = load_tools(device, backend, "jinja2")
 
     from kgs._support.json_files import read_json, write_json
     from kgs.app.page.fit_page import PAGE, write_own_page
@@ -52,8 +52,8 @@ def _evaluate(out: Path, lpips_weights: Path | None, device: str, backend: Backe
     from kgs.metrics.evaluate import as_text
     from kgs.metrics.lpips import Lpips
 
-    lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(device)
-    request, fit = load_fit(out, device, backend, say)
+    lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(torch_device)
+    request, fit = load_fit(out, torch_device, backend, say)
     path = out / "metrics.json"
     metrics = measure_again(fit, path, lpips)
     with replacing(out, "fit") as new:

@@ -27,10 +27,10 @@ _RARE = ("downscale", "lpips_weights", "mask_mode", "frames", "title", "live", "
 
 
 def first_config(words: list[str]) -> FitConfig:
-    """The default of `config`, which follows from --preset and --detail."""
+    """The default of `config`: the command's own device, and what follows from --preset and --detail."""
     preset = PRESETS.get(_value(words, "--preset"), PRESETS["auto"])
     detail = DETAILS.get(_value(words, "--detail"), DETAILS["normal"])
-    return replace(preset, **detail.entries)
+    return replace(preset, device="auto", **detail.entries)
 
 
 def _value(words: list[str], option: str) -> str:
@@ -105,7 +105,7 @@ def fit(
     from kgs.app.files.locks import locked
     from kgs.app.files.outputs import check_folder
     from kgs.app.files.publishing import UNFINISHED
-    from kgs.app.files.results_folder import check_fit_files
+    from kgs.app.files.results_folder import begun_on_cpu, check_fit_files
     from kgs.datasets.folders import CAMERAS_REPORT
     from kgs.datasets.options import check_options
     from kgs.metrics.weights import weight_files
@@ -133,8 +133,12 @@ def fit(
     if config.init == "scene" and (source is None or source.layout != "Blender"):
         kind = "photos without camera poses" if source is None else f"the layout {source.layout}"
         raise ArgumentError(f"init: expected another one for {kind}, got 'scene', Blender's points")
-    load_tools(config.device, config.backend, "safetensors", "jinja2")
+    if resume and config.device == "auto" and begun_on_cpu(out):
+        config = replace(config, device="cpu")  # on a GPU it would go on with other bits
+    device = load_tools(config.device, config.backend, "safetensors", "jinja2")
+    config = replace(config, device=str(device))
 
+    from kgs._support.machine import device_name
     from kgs.app.fit_folder import fit_folder
     from kgs.app.scene_request import SceneRequest
     from kgs.app.stages import Stages
@@ -148,7 +152,7 @@ def fit(
     if config.init_file is not None:
         with warnings.catch_warnings(action="ignore"):
             read_points(config.init_file)  # an error now, not once there are cameras
-    lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(config.device)
+    lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(device)
     request = SceneRequest(
         scene=os.path.abspath(scene),
         train_views=views,
@@ -163,8 +167,9 @@ def fit(
         mask_mode=mask_mode,
     )
     is_free = size is None and downscale is None  # the size follows from --detail
+    say(f"device: {device_name(device)}")
     stages = Stages(say, unposed)
-    if is_free and (detail != "normal" or (unposed and config.device == "cpu")):
+    if is_free and (detail != "normal" or (unposed and device.type == "cpu")):
         size = DETAILS[detail].size
         if config.coarse is None:
             config = replace(config, coarse=COARSE)

@@ -27,7 +27,7 @@ def page(
     background: Background = "black",
     photos: On = True,
     roll: float = 0.0,
-    device: str = "cpu",
+    device: str = "auto",
     backend: Backend = "auto",
 ) -> None:
     """Write a page that shows a splat, in a viewer and beside the photos of a scene.
@@ -45,7 +45,7 @@ def page(
         photos: --no-photos leaves out the photos beside their renders: the page is smaller, and can go where the photos
             must not.
         roll: turn all pictures clockwise by this angle in degrees, where photos lie on their side.
-        device: cpu, cuda, ...
+        device: auto: a GPU if kgs has kernels for it, else the CPU. Or cpu, cuda, cuda:1, ...
         backend: auto: the fastest that is installed. kgs fit --help-all describes the others.
     """
     from kgs.datasets.options import check_options

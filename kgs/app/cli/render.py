@@ -20,7 +20,7 @@ def render(
     out: Out,
     downscale: IfGiven[float] = None,
     background: Literal[Background, "transparent"] = "black",
-    device: str = "cpu",
+    device: str = "auto",
     backend: Backend = "auto",
 ) -> None:
     """Render a splat from every camera of a scene into PNGs.
@@ -37,7 +37,7 @@ def render(
         out: folder for the PNGs, which are named like the scene's photos; not the folder of the photos.
         downscale: reduce the pictures by this factor.
         background: the colour behind the splat; transparent: PNGs with an alpha channel.
-        device: cpu, cuda, ...
+        device: auto: a GPU if kgs has kernels for it, else the CPU. Or cpu, cuda, cuda:1, ...
         backend: auto: the fastest that is installed. kgs fit --help-all describes the others.
     """
     from kgs.app.files.outputs import check_folder, png_names, write_png

@@ -1,6 +1,7 @@
 """What has to be installed for a command: it is loaded here, and an error says what brings a missing package."""
 
 import sys
+import threading
 import traceback
 from contextlib import suppress
 from importlib import import_module
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from kgs._support.errors import printable
 from kgs._support.extras import EXTRAS, missing
+from kgs.app.console import say
 
 from .interrupts import interrupt_as_usual
 
@@ -16,6 +18,7 @@ if TYPE_CHECKING:
     import torch
 
 _ALWAYS = ("torch", "kornia", "numpy", "cv2", "PIL")
+_SILENCE = 5.0  # seconds that the check of a GPU may take without a word
 
 
 def check_installed(*packages: str) -> None:
@@ -31,6 +34,11 @@ def load_tools(device: str = "cpu", backend: str = "auto", *packages: str) -> "t
     It takes seconds: a command calls it after all checks that need no torch. Ctrl-C ends the process at once until
     torch is loaded, and raises KeyboardInterrupt from then on.
 
+    Args:
+        device: its name, or "auto", see :func:`_best_device`.
+        backend: that has to run on it.
+        packages: to load beside those of every command.
+
     Raises:
         ModuleNotFoundError: a package is not installed; nothing was loaded.
         ImportError: a package is installed, but cannot be loaded.
@@ -45,11 +53,51 @@ def load_tools(device: str = "cpu", backend: str = "auto", *packages: str) -> "t
     for package in packages:
         load_package(package)
     from kgs._support.machine import check_device
+
+    if device == "auto":
+        return _best_device(backend)
+    found = check_device(device)
+    _resolve(backend, found)
+    return found
+
+
+def _best_device(backend: str) -> "torch.device":
+    """A GPU on which the backend runs, or "auto" takes kernels; else the CPU.
+
+    A GPU without kernels, or whose kernels fail their check, is taken where the CPU has none either.
+    """
+    import torch
+
+    from kgs._support.machine import check_device
+
+    cpu = torch.device("cpu")
+    gpu = next((kind for kind in ("cuda", "xpu") if torch.get_device_module(kind).is_available()), None)
+    if gpu is not None and backend != "numba":
+        try:
+            found = check_device(gpu)
+            if _resolve(backend, found) != "torch" or _resolve(backend, cpu) == "torch":
+                return found
+            why = f"--device {gpu} takes the GPU, with torch's operators in place of kernels"
+        except ValueError as error:
+            why = printable(error)
+        say(f"kgs: the CPU is used: {why}", sys.stderr)
+    _resolve(backend, cpu)
+    return cpu
+
+
+def _resolve(backend: str, device: "torch.device") -> str:
+    """The backend that is taken on a device; a line says why it takes long, where kernels are compiled for a GPU."""
     from kgs.backends import resolve
 
-    found = check_device(device)
-    resolve(backend, found)
-    return found
+    line = "the kernels for the GPU are checked; the first time on a machine they are compiled, in about a minute"
+    timer = threading.Timer(_SILENCE, say, [line])
+    timer.daemon = True
+    if device.type != "cpu":
+        timer.start()
+    try:
+        return resolve(backend, device)
+    finally:
+        timer.cancel()
 
 
 def load_package(package: str) -> None:

@@ -41,6 +41,15 @@ def has_fit(folder: Path) -> bool:
     return any((folder / name).exists() for name in (CHECKPOINT, PREVIOUS))
 
 
+def begun_on_cpu(out: Path) -> bool:
+    """Whether the fit that would be resumed in this folder is one on a CPU; False where that is not known."""
+    former = next((folder for folder in (out / UNFINISHED, out) if has_fit(folder)), out)
+    try:
+        return str(read_json(former / "config.json")["fit"]["device"]).startswith("cpu")
+    except (DataError, KeyError, TypeError):
+        return False
+
+
 def is_finished(out: Path) -> bool:
     """Whether the folder has the results of a fit that did all its steps."""
     try:

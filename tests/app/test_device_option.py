@@ -1,0 +1,132 @@
+"""`--device` of the commands: what auto takes, what is said of it, and what a resumed fit goes on with."""
+
+import inspect
+import time
+
+import pytest
+import torch
+from command import one_line, run
+
+from kgs import backends
+from kgs._support.json_files import read_json, write_json
+from kgs.app.cli import tools
+from kgs.app.cli.run import COMMANDS, load_command
+from kgs.app.files.publishing import UNFINISHED
+from kgs.app.files.results_folder import CHECKPOINT
+
+QUICK = ("--init", "random", "--init-points", 30, "--evaluations", 1)
+
+
+@pytest.fixture
+def card(monkeypatch):
+    """A machine with a GPU, kernels for it that are installed and trusted, and numba, by these attributes."""
+
+    class Numba(backends.TorchBackend):
+        name, devices, package = "numba", ("cpu",), ("numba", "fast")
+        is_there = True
+
+        def is_installed(self):
+            return self.is_there
+
+    class Triton(backends.TorchBackend):
+        name, devices, package = "triton", ("cuda",), ("triton", "torch brings it")
+        is_there = is_right = True
+        seconds = 0.0
+
+        def is_installed(self):
+            return self.is_there
+
+        def is_trusted(self, device):
+            time.sleep(self.seconds)
+            return self.is_right
+
+    numba, triton = Numba(), Triton()
+    monkeypatch.setattr(backends, "BACKENDS", (numba, triton, backends.TorchBackend()))
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "Card 9000")
+    monkeypatch.setattr("kgs._support.machine.check_device", torch.device)
+    return numba, triton
+
+
+@pytest.mark.parametrize(
+    ("backend", "numba", "kernels", "taken", "said"),
+    [
+        ("auto", True, "right", "cuda", ""),
+        ("auto", False, "right", "cuda", ""),
+        ("auto", True, "wrong", "cpu", "kgs: the CPU is used: --device cuda takes the GPU, with torch's operators"),
+        ("auto", True, "missing", "cpu", "kgs: the CPU is used: --device cuda takes the GPU, with torch's operators"),
+        ("auto", False, "wrong", "cuda", ""),  # torch's operators do the work on either
+        ("torch", True, "wrong", "cuda", ""),
+        ("triton", True, "wrong", "cuda", ""),  # that is how to try them
+        ("numba", True, "right", "cpu", ""),
+    ],
+)
+def test_auto_takes_a_gpu_for_which_there_are_kernels(card, backend, numba, kernels, taken, said, capsys):
+    card[0].is_there = numba
+    card[1].is_right = kernels == "right"
+    card[1].is_there = kernels != "missing"
+    assert tools.load_tools("auto", backend).type == taken
+    lines = capsys.readouterr().err
+    assert lines.startswith(said)
+    assert len(lines.splitlines()) == bool(said)
+
+
+def test_auto_is_the_cpu_without_a_gpu_and_with_one_that_cannot_be_used(card, monkeypatch, capsys):
+    def broken(name):
+        raise ValueError(f"device: expected cpu or a GPU of this machine, got {name!r} (all of it is taken)")
+
+    monkeypatch.setattr("kgs._support.machine.check_device", broken)
+    assert tools.load_tools("auto").type == "cpu"
+    assert "the CPU is used: device: expected" in one_line(capsys)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert tools.load_tools("auto").type == "cpu"
+    assert not capsys.readouterr().err
+    with pytest.raises(ValueError, match='backend: expected "auto" or "torch" on cpu, got "triton"'):
+        tools.load_tools("auto", "triton")
+
+
+def test_a_line_says_why_the_first_use_of_a_gpu_takes_long(card, monkeypatch, capsys):
+    monkeypatch.setattr(tools, "_SILENCE", 0.05)
+    tools.load_tools("auto")
+    assert not capsys.readouterr().out
+    card[1].seconds = 0.3
+    tools.load_tools("cuda")
+    assert capsys.readouterr().out.startswith("the kernels for the GPU are checked; the first time")
+
+
+def test_auto_is_the_default_of_all_commands():
+    defaults = {}
+    for name in COMMANDS:
+        parameters = inspect.signature(load_command(name)).parameters
+        if "device" in parameters:
+            defaults[name] = parameters["device"].default
+    assert defaults.pop("check") is None  # the CPU and all GPUs
+    assert {*defaults} >= {"demo", "render", "eval", "page", "clean", "bench speed"}
+    assert {*defaults.values()} == {"auto"}
+
+
+def test_a_fit_names_its_device_and_keeps_it(folder, tmp_path, capsys):
+    out = tmp_path / "out"
+    threads = torch.get_num_threads()
+    assert run("fit", folder, "-o", out, "--steps", 2, *QUICK) == 0
+    cores = f"{threads} core" if threads == 1 else f"{threads} cores"
+    assert capsys.readouterr().out.startswith(f"device: CPU, {cores}\n")
+    assert read_json(out / "config.json")["fit"]["device"] == "cpu"
+
+
+@pytest.mark.parametrize(("begun", "taken"), [("cpu", "cpu"), ("cpu:0", "cpu"), ("cuda", "cuda"), (None, "cuda")])
+def test_a_fit_of_a_cpu_goes_on_there_where_there_is_a_gpu_too(
+    card, folder, tmp_path, capsys, monkeypatch, begun, taken
+):
+    """With --device auto: on a GPU a resumed fit has other bits."""
+    work = tmp_path / "out" / UNFINISHED
+    work.mkdir(parents=True)
+    if begun is not None:
+        (work / CHECKPOINT).touch()
+        write_json(work / "config.json", {"fit": {"device": begun}})
+    monkeypatch.setattr("kgs.app.files.results_folder.check_fit_files", lambda *_: None)
+    monkeypatch.setattr("kgs.app.fit_folder.fit_folder", lambda *_, **__: (_ for _ in ()).throw(SystemExit(7)))
+    for options, expected in ((("--resume",), taken), (("--resume", "--device", "cuda"), "cuda"), ((), "cuda")):
+        assert run("fit", folder, "-o", tmp_path / "out", *options, *QUICK) == 7
+        named = capsys.readouterr().out.splitlines()[0]
+        assert named.startswith("device: CPU, " if expected == "cpu" else "device: Card 9000 (cuda)")
