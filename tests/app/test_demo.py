@@ -2,6 +2,9 @@
 
 import json
 import os
+import re
+import shutil
+import statistics
 from pathlib import Path
 
 import cv2
@@ -13,7 +16,9 @@ from PIL import Image
 
 import kgs
 from kgs.app.demo_scene import PHOTOS, SIDE, write_bananas, write_room
+from kgs.app.page.fit_page import MAX_PICTURES
 from kgs.datasets import load_scene, synthetic_scene
+from kgs.datasets.splits import select_evenly
 from kgs.fit.config import DROP
 from kgs.geometry import camera_centers
 
@@ -120,7 +125,6 @@ def test_the_folder_of_the_demo_is_that_of_a_fit_with_its_photos(demo):
         "scale {demo} --by 0,0,0 0,0,1 2.5 -o {out}",
         "clean {demo} -o {out}.ply",
         "render {demo}/splat.ply --cameras {demo} -o {out}",
-        "page {demo}/splat.ply --cameras {demo} -o {out}.html",
     ],
 )
 def test_every_command_works_on_it(demo, tmp_path, words):
@@ -129,6 +133,24 @@ def test_every_command_works_on_it(demo, tmp_path, words):
     assert json.loads((demo / "metrics.json").read_text()) == before
     if words.startswith("render"):
         assert len(os.listdir(tmp_path / "out")) == 10  # eight pictures, a marker and its lock
+
+
+def test_a_page_measures_at_the_size_of_the_fit_unless_told_otherwise(demo, tmp_path, capsys):
+    metrics = json.loads((demo / "metrics.json").read_text())
+    views = sorted((*metrics["test"]["views"], *metrics["train"]["views"]), key=lambda view: view["name"])
+    mean = statistics.fmean(views[i]["psnr"] for i in select_evenly(len(views), MAX_PICTURES))
+    shutil.copy(demo / "splat.ply", tmp_path / "elsewhere.ply")
+    # with the numbers of the fit; beside the settings of another program; in a size that was asked for
+    (tmp_path / "config.json").write_text("[1]")
+    cases = [
+        (demo / "splat.ply", (), "40x27"),
+        (tmp_path / "elsewhere.ply", (), "40x27"),
+        (demo / "splat.ply", ("--downscale", 6.3), "80x53"),
+    ]
+    for ply, options, size in cases:
+        assert run("page", ply, "--cameras", demo, "-o", tmp_path / "a.html", *options) == 0
+        level = re.search(rf"8 photos of {size}, PSNR ([\d.]+)", capsys.readouterr().out)[1]
+        assert (float(level) == pytest.approx(mean, abs=0.02)) == (not options)
 
 
 def test_sizes_that_cannot_be_fitted_and_photos_of_others_are_refused(demo, folder, tmp_path, capsys):
