@@ -287,5 +287,14 @@ DETAILS = {
 COARSE = 0.5  # of unposed photos at the size of normal detail
 # A fit, its page and its film in half a minute on two cores: of the photos of `kgs demo`, and of its room.
 DEMO_STEPS = 350
-DEMO = FitConfig(steps=DEMO_STEPS, coarse=0.7, init_points=30_000, max_gaussians=30_000, evaluations=4)
+DEMO = FitConfig(
+    steps=DEMO_STEPS,
+    drop=DROP,
+    sh_degree=0,
+    exposure="same",
+    coarse=0.7,
+    init_points=30_000,
+    max_gaussians=30_000,
+    evaluations=4,
+)
 ROOM_DEMO = replace(DEMO, coarse=0.3, init_points=12_000, max_gaussians=16_000)

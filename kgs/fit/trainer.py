@@ -375,7 +375,7 @@ class Trainer:
         first = state.start.init["points"]
         maximum = state.densifier.max_gaussians
         capped = state.densifier.step().capped
-        if capped and maximum < 1.25 * first:
+        if capped and maximum < 1.25 * first and maximum != self.plan.config.init_points:
             state.note(f"max_gaussians: {maximum} leaves little room beside the {first} initial points")
 
     def _stop_if(self, fault: str) -> None:

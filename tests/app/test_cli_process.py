@@ -124,7 +124,7 @@ MISTAKES = [  # words, what is said of them, and a package that is not installed
     ("fit photos -o out", 'jinja2 is missing: run pip install -e ".[app]"', "jinja2"),
     ("fit photos -o out", 'tyro is missing: run pip install -e ".[app]"', "tyro"),
     ("fit photos -o out", "safetensors is missing", "safetensors"),
-    ("demo -o out --size 11 40", "--size: expected", ""),
+    ("demo -o out --size 31", "--size: expected", ""),
     ("demo -o out --scene garden", "--scene", ""),
     ("render taken/splat.ply --cameras empty -o out", "empty: is not a scene", ""),
     ("render missing --cameras photos -o out", "missing: expected", ""),

@@ -417,7 +417,7 @@ BY = "--by 0,0,0 1,0,0 2"
     ("words", "name"),
     [
         ("fit {scene} -o {out}", "splat.ply"),
-        ("demo -o {out} --size 24 32", "splat.ply"),
+        ("demo -o {out} --size 32", "splat.ply"),
         ("export {fit}/splat.ply -o {out}/a.ply", "a.ply"),
         ("clean {fit}/splat.ply -o {out}/a.ply", "a.ply"),
         (f"scale {{fit}}/splat.ply {BY} -o {{out}}/a.ply", "a.ply"),

@@ -105,7 +105,7 @@ COMMANDS = {
     "scale": ("scale OUT --by 0,0,0 0,0,1 2 -o OUT/more", "more/splat.ply"),
     "export": ("export OUT/splat.ply -o OUT/more/a.compressed.ply", "more/a.compressed.ply"),
     "render": ("render OUT/splat.ply --cameras SCENE -o OUT/more", "more/train_r_0.png"),
-    "demo": ("demo -o OUT/more --steps 3 --size 24 32", "more/splat.ply"),
+    "demo": ("demo -o OUT/more --steps 3 --size 32", "more/splat.ply"),
 }
 
 
@@ -131,7 +131,7 @@ def test_kill_9_of_each_command(
             time.sleep(moments.uniform(0.0, seconds))
             process.kill()
             process.join(PATIENCE)
-        again = [*words, "--resume"] if command == "fit" and trial else words
+        again = [*words, "--resume"] if command in ("fit", "demo") and trial else words
         process = start_command(*again)
         process.join(PATIENCE)
         seconds = seconds or time.monotonic() - start

@@ -64,5 +64,4 @@ def test_dropping_gains_over_seeds():
 def test_the_demo_shows_its_scene(scene, tmp_path):
     """Views that were not used, from few photos: better than any blur of them."""
     assert run("demo", "-o", tmp_path, "--scene", scene) == 0
-    runs = json.loads((tmp_path / "metrics.json").read_text())
-    assert min(run["test"]["psnr"] for run in runs.values()) >= 25.0
+    assert json.loads((tmp_path / "metrics.json").read_text())["test"]["psnr"] >= 25.0

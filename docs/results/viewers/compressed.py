@@ -9,16 +9,10 @@ from pathlib import Path
 
 import kgs
 from kgs.app.saved_fit import load_fit
-from kgs.datasets import synthetic_scene
-from kgs.fit import Fit
 from kgs.metrics.evaluate import evaluate
 
 out, back = map(Path, sys.argv[1:])
-if (out / "config.json").exists():
-    fit = load_fit(out)[1]
-else:
-    scene = synthetic_scene(train_views=3, test_views=3, size=(378, 504), seed=0)
-    fit = Fit(scene, kgs.load_ply(out / "splat.ply"), kgs.RasterOptions())
+fit = load_fit(out)[1]
 plain = replace(fit, model=kgs.load_ply(out / "splat.ply", origin=fit.scene.offset))
 rounded = replace(fit, model=kgs.load_ply(back, origin=fit.scene.offset))
 sizes = [(out / name).stat().st_size for name in ("splat.ply", "splat.compressed.ply")]

@@ -16,6 +16,12 @@ def check_roll(roll: float) -> None:
         raise ArgumentError(f"roll: expected degrees in [-360, 360], got {roll}")
 
 
+def check_side(size: int) -> None:
+    """Raise a ValueError unless photos can be fitted with so many pixels on their longer side."""
+    if size < SMALLEST:
+        raise ArgumentError(f"size: expected at least {SMALLEST} pixels, got {size}")
+
+
 def check_file(out: Path, ending: str, kind: str, source: Path | None = None) -> None:
     """Raise a ValueError or DataError unless a command can write its result to this file, which is not `source`.
 

@@ -1,26 +1,28 @@
-"""`kgs demo`: fits a built-in scene with DropGaussian, and to compare without it from the same initial points."""
+"""`kgs demo`: fits a built-in scene as `kgs fit` fits a scene, and to compare once more without DropGaussian."""
 
 import math
-from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from kgs._support.errors import ArgumentError, printable
+from kgs._support.errors import printable
 from kgs.app.console import VIEWER, as_line, each, say, say_next
-from kgs.fit.config import DEMO, DEMO_STEPS, DROP, ROOM_DEMO, Backend, FitConfig
+from kgs.datasets.folders import LAYOUT_FILES
+from kgs.fit.config import DEMO, DEMO_STEPS, ROOM_DEMO, Backend, FitConfig
 
-from .options import Out
+from .checks import check_side
+from .options import IfGiven, Out
 from .tools import load_tools
 
 if TYPE_CHECKING:
+    from kgs.app.scene_request import SceneRequest
     from kgs.datasets.scene import Scene
     from kgs.fit.fit import Fit
 
-PHOTOS = Path(__file__).parents[1] / "demo_photos"  # six training photos, two held out, and their cameras
-PHOTO_SIZE = 335, 504  # their height and width
-CREDIT = "Photos: Piero Toffanin, dataset_banana (MIT licence)."
-MIN_SIDE = 12  # pixels: the window of SSIM
+_SHEET = "demo.png"  # held-out photos beside their renders
+_CAMERAS = LAYOUT_FILES["nerfstudio"]
+_WITHOUT = "without.json"  # the measures of the fit without dropping
 
 
 def demo(
@@ -28,12 +30,13 @@ def demo(
     out: Out = Path("demo"),
     scene: Literal["bananas", "room"] = "bananas",
     steps: int = DEMO_STEPS,
-    size: tuple[int, int] = (378, 504),
+    size: IfGiven[int] = None,
     compare: bool = False,
+    resume: bool = False,
     seed: int = 0,
     device: str = "auto",
     backend: Backend = "auto",
-) -> None:
+) -> int:
     """Fit six photos of bananas, and measure the fit on two held-out photos.
 
     For example:
@@ -41,92 +44,97 @@ def demo(
       kgs demo -o demo1 --compare --seed 1
 
     Args:
-        out: folder for index.html, demo.png, curve.png, metrics.json, splat.ply, .compressed.ply and .glb, cameras.json
-            and turntable.webm (.mp4 where there is an encoder).
+        out: folder for the results. They are those of kgs fit, with the photos and their cameras, so that every command
+            works on them; demo.png has held-out photos beside their renders.
         scene: bananas: photos by Piero Toffanin (dataset_banana, MIT licence), whose cameras were found from all eight.
             room: a synthetic one, three training and three held-out views.
         steps: training steps; all of the demo takes half a minute on 2 cores with the default.
-        size: height and width of the pictures; photos are reduced until they fit in, and never enlarged.
+        size: reduce the photos to this many pixels on their longer side. Unless given: their own size, 504.
         compare: fit a second time without DropGaussian, from the same initial points. For most seeds the two differ
             little.
+        resume: continue a demo that was stopped.
         seed: of everything random: the room, the initial points and the fits.
         device: auto: a GPU if kgs has kernels for it, else the CPU. Or cpu, cuda, cuda:1, ...
         backend: auto: the fastest that is installed. kgs fit --help-all describes the others.
     """
+    from kgs.app.files.locks import locked
     from kgs.app.files.outputs import check_folder
-    from kgs.app.files.publishing import check_free
-    from kgs.app.files.results_folder import SPLAT_FILES
+    from kgs.app.files.publishing import UNFINISHED, check_free
+    from kgs.app.files.results_folder import begun_on_cpu, check_fit_files
+    from kgs.datasets.folders import CAMERAS_REPORT, list_images
 
     preset = ROOM_DEMO if scene == "room" else DEMO
-    config = replace(preset, seed=seed, steps=steps, backend=backend)
-    check_size(scene, size)
+    if size is not None:
+        check_side(size)
     check_folder(out, make=False)
-    check_free(out, "demo", (*SPLAT_FILES, "metrics.json", "curve.png", "demo.png"))
-    found = load_tools(device, backend, "jinja2")
+    with locked(out) if (out / UNFINISHED).is_dir() else nullcontext():
+        check_fit_files(out, resume, [_SHEET, _WITHOUT])
+        for folder in (out, out / UNFINISHED):
+            images = folder / "images"
+            there = [f"images/{path.name}" for path in list_images(images)] if images.is_dir() else []
+            check_free(folder, "photos", [_CAMERAS, CAMERAS_REPORT, "images/LICENSE", *there])
+    if resume and device == "auto" and begun_on_cpu(out):
+        device = "cpu"  # on a GPU it would go on with other bits
+    found = load_tools(device, backend, "jinja2", "safetensors")
+    config = replace(preset, seed=seed, steps=steps, device=str(found), backend=backend)
 
     from kgs._support.machine import device_name
+    from kgs.app.demo_scene import CREDIT
+    from kgs.app.fit_folder import fit_folder
+    from kgs.metrics.evaluate import as_text
 
     say(f"device: {device_name(found)}")
-    config = replace(config, device=str(found))
-    drops = {"without": 0.0, "with": DROP} if compare else {"with": DROP}
-    notes = [CREDIT] if scene == "bananas" else []
-    runs = run_demo(load_demo(scene, size, seed), config, out, drops, notes)
-    say(f"\n{'':22}{'PSNR':>8}{'SSIM':>8}{'train PSNR':>12}{'Gaussians':>11}{'seconds':>9}")
-    level = {name: [_level(run[part]) for part in ("test", "train")] for name, run in runs.items()}
-    for name, run in runs.items():
-        columns = f"{level[name][0]:8.2f}{run['test']['ssim']:8.3f}{level[name][1]:12.2f}"
-        say(f"{name + ' DropGaussian':<22}{columns}{run['gaussians']:11d}{run['seconds']:9.1f}")
-    if compare:
-        gain = level["with"][0] - level["without"][0]
-        say(f"\ndifference on test views: {gain:+.2f} dB of one seed; seeds differ by more (try --seed 1, 2, ...)")
-    for note in notes:
-        say(note)
-    say(f"pictures: {printable(out / 'demo.png')}, {printable(out / 'curve.png')}")
+    request, loaded = _write_scene(scene, out, size, seed, resume)
+    height, width = loaded.train.images.shape[-2:]
+    say(f"{len(loaded.train)} training and {len(loaded.test)} test views of {width}x{height}")
+    published = fit_folder(loaded, config, out, request, resume=resume)
+    splat = published.folder / "splat.ply"
+    if published.signal:
+        say_next("the same command with --resume goes on where it stopped")
+        return 128 + published.signal
+    say(as_text(published.fit.metrics))
+    _compare(published.fit, config if compare else None, request, out)
+    if scene == "bananas":
+        say(CREDIT)
+    say(f"pictures: {printable(out / _SHEET)}, {printable(out / 'curve.png')}")
     say_next(
         f"open {as_line(out / 'index.html')} in a browser",
         "kgs fit PHOTOS -o OUT  # three or more photos of your own",
-        VIEWER.format(as_line(out / "splat.ply")),
+        VIEWER.format(as_line(splat)),
     )
+    return 0
 
 
-def load_demo(name: str, size: tuple[int, int], seed: int) -> "Scene":
-    """The bananas or the room, in pictures of at most this height and width."""
-    from kgs.datasets import load_scene, synthetic_scene
+def _write_scene(name: str, out: Path, size: int | None, seed: int, resume: bool) -> "tuple[SceneRequest, Scene]":
+    """Write the photos to the folder of an unfinished fit, as `pose_photos` does; then load them."""
+    from kgs.app.demo_scene import SIDE, write_bananas, write_room
+    from kgs.app.files.locks import locked
+    from kgs.app.files.publishing import UNFINISHED, complete, replacing
+    from kgs.app.files.results_folder import check_no_fit
+    from kgs.app.scene_request import SceneRequest
+    from kgs.datasets.source import SceneSource
 
-    if name == "room":
-        return synthetic_scene(train_views=3, test_views=3, size=size, seed=seed)
-    return load_scene(PHOTOS, downscale=_reduction(size))
+    work = out / UNFINISHED
+    out.mkdir(parents=True, exist_ok=True)
+    with locked(out):
+        complete(out)
+        if not resume:
+            check_no_fit(work)
+        with replacing(work, "photos", all_former=True) as new:
+            if name == "room":
+                write_room(new, size or SIDE, seed)
+            else:
+                write_bananas(new)
+    reduced = 1.0 if name == "room" or size is None else max(1.0, SIDE / size)
+    request = SceneRequest(".", downscale=reduced, title="kgs demo")
+    return request, request.load(out, say, SceneSource(work))
 
 
-def check_size(scene: str, size: tuple[int, int]) -> None:
-    """Raise a ValueError where pictures of this size would be too small for the SSIM."""
-    if min(size) < MIN_SIDE:
-        raise ArgumentError(f"size: expected at least {MIN_SIDE} pixels a side, got {size[0]} {size[1]}")
-    if scene == "bananas" and min(PHOTO_SIZE) / _reduction(size) < MIN_SIDE:
-        min_width = math.ceil(MIN_SIDE * PHOTO_SIZE[1] / PHOTO_SIZE[0])
-        raise ArgumentError(f"size: expected at least {MIN_SIDE} {min_width} for these photos, got {size[0]} {size[1]}")
-
-
-def _reduction(size: tuple[int, int]) -> float:
-    """The factor by which the photos are reduced to fit into this height and width."""
-    return max(1.0, PHOTO_SIZE[0] / size[0], PHOTO_SIZE[1] / size[1])
-
-
-def run_demo(
-    scene: "Scene", config: FitConfig, out: Path, drops: dict[str, float], notes: Sequence[str] = ()
-) -> dict[str, dict[str, Any]]:
-    """Fit a scene once or twice, and write pictures, page and all other files; returns the content of metrics.json.
-
-    Args:
-        scene: with test views.
-        config: of all fits, but for `drop`.
-        out: folder of the files.
-        drops: rates of dropping by the name of the run; pictures show the last one beside the others.
-        notes: sentences for the page.
-    """
-    from kgs._support.json_files import write_json
-    from kgs.app.files.exports import write_exports
+def _compare(fit: "Fit", config: FitConfig | None, request: "SceneRequest", out: Path) -> None:
+    """Write held-out photos beside their renders: with dropping, and with a `config` of a fit without, too."""
+    from kgs._support.json_files import read_json, write_json
     from kgs.app.files.figures import write_curve, write_sheet
+    from kgs.app.files.locks import locked
     from kgs.app.files.publishing import replacing
     from kgs.app.fit_folder import train
     from kgs.app.page.fit_page import PAGE, write_fit_page
@@ -134,42 +142,43 @@ def run_demo(
     from kgs.fit.plan import make_plan
     from kgs.fit.run import choose_points
     from kgs.fit.trainer import Trainer
-    from kgs.ply import save_ply
 
-    points = choose_points(scene, config, each)
-    height, width = scene.train.images.shape[-2:]
-    say(f"{len(scene.train)} training and {len(scene.test)} test views of {width}x{height}")
-    say(f"initial points: {len(points.points)} ({points.kind})")
-    plan = make_plan(scene, config)
-    Trainer(scene, plan, points).train_step()  # discarded: it compiles the kernels before the clock starts
-    fits = dict[str, "Fit"]()
-    runs = dict[str, Any]()
-    for name, drop in drops.items():
-        title = f"{name} DropGaussian"
-        trainer = Trainer(scene, replace(plan, config=replace(plan.config, drop=drop)), points)
-        fit, signal = train(trainer, None, title=title)
+    scene = fit.scene
+    fits = {"with DropGaussian": fit}
+    if config is not None:
+        points = choose_points(scene, config, each)
+        plain, signal = train(Trainer(scene, make_plan(scene, replace(config, drop=0.0)), points), None, title="fit")
         if signal:
             raise SystemExit(128 + signal)
-        runs[name] = measure(fit)
-        fits[title] = fit.annotated(metrics=runs[name])
-    levels = list(map(_level, runs[name]["test"]["views"]))
-    worst = sorted(range(len(levels)), key=levels.__getitem__)[:2]
+        fits = {"without DropGaussian": plain.annotated(metrics=measure(plain)), **fits}
+        _say_difference(fits)
     renders = {title: [image[0] for image in one.test_renders.images] for title, one in fits.items()}
-    shown = [f"The viewer and the sliders show the fit {title}."] if len(runs) > 1 else []
-    with replacing(out, "demo", all_former=True) as new:
-        save_ply(new / "splat.ply", fit.model, offset=scene.offset)
-        for note in write_exports(fit, new):
-            say(note)
-        write_json(new / "metrics.json", runs)
-        write_curve(new / "curve.png", {title: one.history["curve"] for title, one in fits.items()})
-        write_sheet(new / "demo.png", scene.test, renders, sorted(worst))
-        write_fit_page(
-            new / PAGE,
-            "kgs demo",
-            fits,
-            notes=[*shown, *notes],
-        )
-    return runs
+    levels = list(map(_level, fit.metrics["test"]["views"]))
+    worst = sorted(range(len(levels)), key=levels.__getitem__)[:2]
+    with locked(out), replacing(out, "fit") as new:
+        write_sheet(new / _SHEET, scene.test, renders, sorted(worst))
+        if config is not None:
+            write_json(new / _WITHOUT, fits["without DropGaussian"].metrics)
+            write_curve(new / "curve.png", {title: one.history["curve"] for title, one in fits.items()})
+            write_fit_page(
+                new / PAGE,
+                request.title,
+                fits,
+                notes=["The viewer and the sliders show the fit with DropGaussian."],
+                settings=read_json(out / "config.json"),
+            )
+
+
+def _say_difference(fits: "dict[str, Fit]") -> None:
+    """A table of the two fits, and by how much they differ."""
+    say(f"\n{'':22}{'PSNR':>8}{'SSIM':>8}{'train PSNR':>12}{'Gaussians':>11}")
+    for title, fit in fits.items():
+        test = fit.metrics["test"]
+        columns = f"{_level(test):8.2f}{test['ssim']:8.3f}{_level(fit.metrics['train']):12.2f}"
+        say(f"{title:<22}{columns}{len(fit.model):11d}")
+    without, dropped = (_level(fit.metrics["test"]) for fit in fits.values())
+    gain = f"{dropped - without:+.2f} dB"
+    say(f"\ndifference on test views: {gain} of one seed; seeds differ by more (try --seed 1, 2, ...)")
 
 
 def _level(measures: dict[str, Any]) -> float:

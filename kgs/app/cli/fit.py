@@ -16,7 +16,7 @@ from kgs._support.errors import ArgumentError, DataError, printable
 from kgs.app.console import VIEWER, as_line, say, say_next
 from kgs.fit.config import COARSE, DETAILS, PRESETS, Background, FitConfig, min_side
 
-from .checks import SMALLEST, check_photos, check_photos_of, check_roll
+from .checks import SMALLEST, check_photos, check_photos_of, check_roll, check_side
 from .options import QUIET, IfGiven, On, Out, options_in
 from .tools import check_installed, load_tools
 from .unposed import find_scene, on_ctrl_c, open_scene
@@ -253,8 +253,8 @@ def _check_size(size: int | str | None, downscale: float | None, unposed: bool) 
         raise ArgumentError(f"size: expected pixels, field or a folder as images_8, got {size!r}")
     if isinstance(size, str) and unposed:
         raise ArgumentError(f"size: expected pixels for photos without camera poses, got {size!r}")
-    if isinstance(size, int) and size < SMALLEST:
-        raise ArgumentError(f"size: expected at least {SMALLEST} pixels, got {size}")
+    if isinstance(size, int):
+        check_side(size)
 
 
 def _check_frames(frames: int | None, scene: Path) -> None:

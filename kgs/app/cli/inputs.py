@@ -1,5 +1,6 @@
 """What several commands load: scenes, cameras and splats."""
 
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from kgs.fit.fit import Fit
 
 
-def load_cameras(source: SceneSource, downscale: float | None, photos: bool = False, **options: Any) -> "Scene":
+def load_cameras(source: SceneSource, downscale: float | None = None, photos: bool = False, **options: Any) -> "Scene":
     """The scene without its photos, of which there may be hundreds, or with them; all views are training views."""
     from kgs.datasets import load_scene
 
@@ -23,6 +24,23 @@ def load_cameras(source: SceneSource, downscale: float | None, photos: bool = Fa
     for note in scene.notes:
         say(note)
     return scene
+
+
+def options_of_fit(ply: Path, source: SceneSource) -> dict[str, Any]:
+    """How the fit that made a splat loaded the photos of a scene, as arguments of `load_scene`: their size and masks.
+
+    Empty if the splat does not lie in the folder of a fit to this scene, and the scene is not such a folder.
+    """
+    from kgs.app.saved_fit import read_settings
+
+    for folder in (ply.parent, source.root):
+        with suppress(DataError):  # there is no fit, or this is a file of another program
+            request, _ = read_settings(folder / "config.json")
+            if (folder / request.scene).resolve() == source.root.resolve():
+                masks = folder / request.masks if request.masks else None
+                names = ("downscale", "photo_folder", "mask_mode")
+                return {**{name: getattr(request, name) for name in names}, "masks": masks}
+    return {}
 
 
 def load_splat(ply: Path, scene: "Scene", device: "torch.device", backend: str) -> "Fit":

@@ -9,7 +9,7 @@ from kgs.app.console import as_line, say, say_next
 from kgs.fit.config import Backend, Background
 
 from .checks import check_file, check_photos_of, check_roll
-from .inputs import load_cameras, load_splat
+from .inputs import load_cameras, load_splat, options_of_fit
 from .options import IfGiven, On, Out
 from .tools import load_tools
 
@@ -40,7 +40,8 @@ def page(
         ply: a 3DGS PLY file.
         cameras: the scene (folder of LLFF, COLMAP, Blender or nerfstudio) whose cameras and photos to use.
         out: the HTML file to write.
-        downscale: reduce the photos by this factor.
+        downscale: reduce the photos by this factor. Unless given: to the size of the fit, where the splat or the scene
+            is in the folder of one.
         background: the colour behind the splat, and behind photos with transparency.
         photos: --no-photos leaves out the photos beside their renders: the page is smaller, and can go where the photos
             must not.
@@ -65,13 +66,16 @@ def page(
     from kgs.losses.photometric import WINDOW
     from kgs.metrics.evaluate import evaluate
 
-    scene = load_cameras(source, downscale, background=background)
+    options = {**options_of_fit(ply, source), "background": background}
+    if downscale is not None:
+        options |= {"downscale": downscale, "photo_folder": ""}
+    scene = load_cameras(source, **options)
     height, width = scene.train.images.shape[-2:]
     if min(height, width) < WINDOW:
         raise ArgumentError(f"downscale: expected photos of at least {WINDOW} pixels a side, got {width}x{height}")
     fit = load_splat(ply, scene, torch_device, backend)
     few = spread(len(scene.train), MAX_PICTURES)
-    photographed = load_scene(source, len(few), downscale, hold_out=0, background=background)
+    photographed = load_scene(source, len(few), hold_out=0, **options)
     pictured = in_frame_of(scene, photographed)
     fit = replace(fit, metrics={"views": evaluate(fit.render, pictured), "versions": versions()})
     with replacing(out.parent, "page") as new:
@@ -88,7 +92,7 @@ def page(
         )
     level = fit.metrics["views"]["psnr"]
     measured = f", PSNR {level:.4g}" if level is not None else ""
-    say(f"{printable(out)}: {len(fit.model)} Gaussians, {len(scene.train)} photos{measured}")
+    say(f"{printable(out)}: {len(fit.model)} Gaussians, {len(scene.train)} photos of {width}x{height}{measured}")
     if cost:
         say(f"the page shows {cost}; {printable(ply)} has everything")
     say_next(f"open {as_line(out)} in a browser")

@@ -71,5 +71,6 @@ def render(
             if is_transparent:  # PNG's colours are not multiplied by alpha
                 image = torch.cat([image / rendering.alpha.clamp_min(1e-6), rendering.alpha], 1)
             write_png(new / names[name], as_taken(image[0], scene.train, i))
-    say(f"{len(names)} pictures in {printable(out)}")
+    height, width = scene.train.images.shape[-2:]
+    say(f"{len(names)} pictures of {width}x{height} in {printable(out)}")
     say_next(VIEWER.format(as_line(ply)))

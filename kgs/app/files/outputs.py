@@ -39,7 +39,8 @@ def check_folder(out: Path, scene: Path | None = None, make: bool = True) -> Non
         raise DataError(out, "", f"results cannot be written there: no permission for {there}")
     inside = scene is not None and out.resolve().is_relative_to(scene.resolve())
     has_photos = inside and there == out and not is_own(out, *(path.name for path in list_images(out)))
-    of_photos = ("sparse",) if (out / CAMERAS_REPORT).exists() else ()  # kgs wrote it: cameras that a former run found
+    # kgs wrote these: the cameras that a former run found, or those of the demo
+    of_photos = ("sparse", LAYOUT_FILES["nerfstudio"]) if (out / CAMERAS_REPORT).exists() else ()
     if has_photos or any((out / name).exists() for name in _SCENES if name not in of_photos):
         raise DataError(out, "", "holds photos or files of a scene: choose another folder for the results")
     if make:
