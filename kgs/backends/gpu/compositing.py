@@ -115,7 +115,7 @@ class GpuCompositor(Compositor):
                 launch(composite_backward, grid, *given, first, moments, ABSOLUTE=needs_absolute, warps=1)
                 launch(
                     sum_entries,
-                    (blocks(n, 8),),
+                    (blocks(n, LANES),),
                     *(self._order, rows.begins, moments, factors, opacities, self._eps2d, n, channels, first),
                     *(*input_grads, absolute),
                     MOMENTS=any(needs[:3]),
@@ -123,8 +123,8 @@ class GpuCompositor(Compositor):
                     ABSOLUTE=needs_absolute,
                     ADD=later_slice or first > 0,
                     ADD_FEATURES=later_slice,
-                    BLOCK=8,
-                    STRIDE=16,
+                    BLOCK=LANES,
+                    warps=1,
                 )
 
         for rows in self._slices:
