@@ -34,7 +34,9 @@ class RasterOptions:
             error is at most this value times the number of Gaussians that cover the pixel.
         transmittance_stop: transmittance below it counts as 0, in [0, 1); the error is at most this value.
         max_bytes: bound for the working memory of one call in bytes, without what is kept per Gaussian and per pixel.
-            An image that needs more is rendered in row slices, which the backward pass computes again.
+            An image that needs more is rendered in row slices; those that are not kept within the bound are computed
+            again by the backward pass. None: 1 GiB; the kernels of a GPU take up to half of its free memory, so that
+            gradients of an image which needs more than 1 GiB can differ by rounding with what else is on the card.
         frame: (left, top, right, bottom) in pixels of the image; None for the whole image. Footprints are linearised no
             farther than 15 % of the frame's size beyond its borders. A render that is wider than the images which the
             Gaussians were fitted to shows the same inside their frame if it is given: else off-frame Gaussians get
@@ -58,7 +60,7 @@ class RasterOptions:
     eps2d: float = 0.3
     alpha_threshold: float = 1 / 255
     transmittance_stop: float = 1e-4
-    max_bytes: int = 2**30
+    max_bytes: int | None = None
     frame: tuple[float, float, float, float] | None = None
     absgrad: bool = False
     far_plane: float = math.inf
@@ -71,7 +73,7 @@ class RasterOptions:
                 raise ArgumentError(f"{name}: expected True or False, got {getattr(self, name)!r}")
         for name in ("tile_size", "max_bytes"):
             value: Any = getattr(self, name)
-            if name == "tile_size" and value is None:
+            if value is None:
                 continue
             if isinstance(value, bool) or not isinstance(value, Integral) or int(value) < 1:
                 raise ArgumentError(f"{name}: expected an integer >= 1, got {value!r}")

@@ -153,7 +153,8 @@ class FitConfig:
         max_gaussians: largest number of Gaussians, at which densification stops. Unless given: 10 per step, and at
             least 1.5 times the number of initial points.
         prune: whether Gaussians that no training view shows are removed, and harmonics that change no image.
-        max_bytes: bound on the working memory of a render, in bytes; it changes results only by rounding.
+        max_bytes: bound on the working memory of a render, in bytes; it changes results only by rounding. Unless given:
+            that of `kgs.RasterOptions`.
         evaluations: how often the PSNR curve is measured, the last time at the end.
         device: cpu, cuda, ... auto: a GPU if one is of use.
         backend: numba: compiled, several times faster than torch, only on a CPU. triton: compiled, only on a GPU. auto:
@@ -180,7 +181,7 @@ class FitConfig:
     training_background: Literal["random", "scene"] = "random"
     max_gaussians: Annotated[int | None, _Range(1, 10**9)] = None
     prune: bool = True
-    max_bytes: Annotated[int, _Range(1, 2**62)] = 2**30  # the default of RasterOptions, which would import torch
+    max_bytes: Annotated[int | None, _Range(1, 2**62)] = None
     evaluations: _Steps = 8
     device: str = "cpu"
     backend: Backend = "auto"

@@ -70,7 +70,7 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
     pixel_centers: str = "half",
     alpha_threshold: float = RasterOptions.alpha_threshold,
     transmittance_stop: float = RasterOptions.transmittance_stop,
-    max_bytes: int = RasterOptions.max_bytes,
+    max_bytes: int | None = RasterOptions.max_bytes,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render N Gaussians in C cameras; a drop-in for `gsplat.rasterization` of gsplat 1.6, and of 1.5 by name.

@@ -143,6 +143,25 @@ def test_only_what_is_asked_for_has_a_gradient(kernels, wanted):
     assert_alike(*wide_scene(1, 60), kernels, (wanted,), accuracy=1e-5)
 
 
+def test_gaussians_of_which_one_value_or_none_has_a_gradient_and_what_is_not_a_number(kernels):
+    gaussians, cameras = wide_scene(3, 40, cameras=2)
+    found = []
+    for target, dtype in ((kernels, torch.float32), (TORCH, torch.float64)):
+        moved, inputs = leaves(target.move(gaussians, dtype))
+        got = project(moved, target.move(cameras, dtype), backend=target.backend)
+        values = [getattr(got, name) for name in DIFFERENTIABLE]
+        weights = [torch.zeros_like(value) for value in values]
+        for i, weight in enumerate(weights):  # every sixth row has none
+            weight[i::6] = torch.arange(1.0, 1.0 + weight[i::6].numel()).to(weight).view_as(weight[i::6])
+        found.append([x.cpu() for x in torch.autograd.grad(values, inputs, weights, retain_graph=True)])
+        weights[3][0] = torch.nan
+        broken = torch.autograd.grad(values, inputs, weights)[3].cpu()
+        assert broken.isnan().nonzero().tolist() == [[int(got.gaussian_ids[0])]]
+    for x, y in zip(*found, strict=True):
+        assert (x - y).abs().max() <= 3e-6 * y.abs().max()
+        assert not bool(y.all())
+
+
 def test_a_second_backward_needs_the_graph_and_a_second_derivative_is_refused(kernels):
     gaussians, cameras = (kernels.move(x) for x in wide_scene(n=60))
     with torch.inference_mode():

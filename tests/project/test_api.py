@@ -74,7 +74,7 @@ SIGNATURES = {
     "kgs.GaussianRenderer": "opacity_layer=None, options=None, backend='auto'",
     "kgs.GaussianRenderer.forward": "self, gaussians, cameras, background=None, outputs=('image',)",
     "kgs.RasterOptions": """
-        tile_size=None, near_plane=0.01, eps2d=0.3, alpha_threshold=1 / 255, transmittance_stop=1e-4, max_bytes=2**30,
+        tile_size=None, near_plane=0.01, eps2d=0.3, alpha_threshold=1 / 255, transmittance_stop=1e-4, max_bytes=None,
         frame=None, absgrad=False, far_plane=math.inf, radius_clip=0.0, antialiased=False
     """,
     "kgs.GaussianModel.from_points": "points, colors, sh_degree=3",

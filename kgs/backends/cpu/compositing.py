@@ -12,7 +12,7 @@ from kgs._support.compiled.threads import parallel_for
 from kgs._support.memory import array, empty
 from kgs._support.torch_threads import thread_count
 from kgs.backends.base import CompositingCall, CompositingInputs, Compositor, Images
-from kgs.backends.row_slices import row_slices
+from kgs.backends.row_slices import MAX_BYTES, row_slices
 
 from . import compositing_kernels as kernels
 from .binning import Band, RowSlice, TileCoverage, table_width
@@ -38,6 +38,7 @@ class CpuCompositor(Compositor):
         projected = call.projected
         features = call.features
         options = call.options
+        max_bytes = options.max_bytes or MAX_BYTES
         self._blocks = _blocks(features.shape[1])
         channels = sum(width for _, width in self._blocks)
         # a span, and at most one member for it: number, row of the table, sums; an entry, and its share of what is kept
@@ -58,11 +59,11 @@ class CpuCompositor(Compositor):
             np.float32(options.alpha_threshold),
             channels,
             self._median_depth,
-            max_spans=max(2**12, options.max_bytes // (2 * per_span)),
+            max_spans=max(2**12, max_bytes // (2 * per_span)),
             threads=thread_count(),
         )
         row_bytes = self._coverage.spans_per_row * per_span + self._coverage.entries_per_row * per_entry
-        self._row_slices = row_slices(row_bytes.tolist(), options.max_bytes)
+        self._row_slices = row_slices(row_bytes.tolist(), max_bytes)
         self._threshold = np.float32(max(options.alpha_threshold, kernels.TINY))
         self._stop = np.float32(max(options.transmittance_stop, kernels.TINY))
 

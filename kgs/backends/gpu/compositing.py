@@ -1,13 +1,14 @@
 """Compositing by the kernels: lists, images, gradients."""
 
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from kgs.backends.base import CompositingCall, CompositingInputs, Compositor, Images
-from kgs.backends.row_slices import check_fits
+from kgs.backends.row_slices import check_fits, default_max_bytes
 
 from . import entry_counts
 from .binning_kernels import count_entries, fill_entries, fill_table, list_tiles
@@ -17,6 +18,7 @@ from .launch import blocks, launch
 _TINY = 2.0**-125  # smaller alphas and T are 0: products with them would be denormal
 # bytes of an entry: tile and rank, both sorted, its slot, memory of the sort; its share of T; its row of moments
 _PER_ENTRY = 4 * (2 + 2 + 2 + 4 + SIZE * SIZE // K + ROW)
+_KEPT_PER_ENTRY = 4 * (1 + 2 + SIZE * SIZE // K)  # rank, slot, share of T
 LANES = 32  # Gaussians of a program that goes through their tiles
 _BLOCK = 128  # Gaussians or entries of another
 
@@ -74,16 +76,22 @@ class GpuCompositor(Compositor):
         ellipses = (self._order, *footprints, projected.camera_ids.contiguous(), self._eps2d, log2_threshold)
         self._ellipses = (*ellipses, *self._size, self._image_rows)
         whole = (_add_up(counts, begins), known.entries) if known else None
-        self._slices = self._fitting(0, self._cameras * self._image_rows, options.max_bytes, whole)
+        self._max_bytes = options.max_bytes or 0  # or, by how much all lists take, in `_fitting`
+        self._slices = self._fitting(0, self._cameras * self._image_rows, whole)
 
     def forward(self, inputs: CompositingInputs, keep: bool) -> tuple[Images, Any]:
-        """See `Compositor`. One row slice is kept, several are computed again."""
+        """See `Compositor`. Keeps as many of the first row slices as there is room for, others are computed again."""
         features = inputs.features
         widths = (features.shape[1], 1, 1 if self._median_depth else 0)
         images = [features.new_empty(self._cameras, width, *self._size) for width in widths]
-        keep = keep and len(self._slices) == 1
-        lists = [self._composite_rows(rows, features, images, keep) for rows in self._slices]
-        return (images[0], images[1], images[2]), lists[0] if keep else None
+        number = self._number_kept() if keep else 0
+        kept = []
+        for i, rows in enumerate(self._slices):
+            lists = self._composite_rows(rows, features, images, i < number)
+            if i < number:
+                kept.append(lists)
+            del lists
+        return (images[0], images[1], images[2]), kept
 
     def backward(
         self,
@@ -115,7 +123,7 @@ class GpuCompositor(Compositor):
                 launch(composite_backward, grid, *given, first, moments, ABSOLUTE=needs_absolute, warps=1)
                 launch(
                     sum_entries,
-                    (blocks(n, 8),),
+                    (blocks(n, LANES),),
                     *(self._order, rows.begins, moments, factors, opacities, self._eps2d, n, channels, first),
                     *(*input_grads, absolute),
                     MOMENTS=any(needs[:3]),
@@ -123,13 +131,12 @@ class GpuCompositor(Compositor):
                     ABSOLUTE=needs_absolute,
                     ADD=later_slice or first > 0,
                     ADD_FEATURES=later_slice,
-                    BLOCK=8,
-                    STRIDE=16,
+                    BLOCK=LANES,
+                    warps=1,
                 )
 
         for rows in self._slices:
-            add(rows, self._composite_rows(rows, features, None, True) if kept is None else kept)
-            kept = None
+            add(rows, kept.pop(0) if kept else self._composite_rows(rows, features, None, True))
         gradients = tuple(x if need else None for x, need in zip(input_grads, needs, strict=True))
         return gradients, absolute if needs_absolute else None
 
@@ -147,19 +154,33 @@ class GpuCompositor(Compositor):
         launch(count_entries, (blocks(n, LANES),), *self._ellipses, *rows, BLOCK=LANES, warps=1)
         return begins, int(_add_up(counts, begins)[-1])
 
-    def _fitting(self, begin: int, end: int, max_bytes: int, known: tuple[Tensor, int] | None = None) -> list[_Rows]:
+    def _fitting(self, begin: int, end: int, known: tuple[Tensor, int] | None = None) -> list[_Rows]:
         """Row slices of the rows `begin` to `end` whose lists take at most `max_bytes`: halves, where they do not.
 
         `known` are the counts of all these rows.
         """
         begins, entries = self._count(begin, end) if known is None else known
-        size = entries * _PER_ENTRY + (end - begin) * self._columns * SIZE * SIZE * 4
-        if size > max_bytes and end - begin > 1:
+        rows = _Rows(begin, end, begins, entries)
+        size = self._bytes(rows, _PER_ENTRY)
+        if not self._max_bytes:  # these are all rows
+            self._max_bytes = default_max_bytes(size, begins.device)
+        if size > self._max_bytes and end - begin > 1:
             middle = (begin + end) // 2
-            del begins, known
-            return self._fitting(begin, middle, max_bytes) + self._fitting(middle, end, max_bytes)
-        check_fits(size, max_bytes)
-        return [_Rows(begin, end, begins, entries)]
+            del begins, known, rows
+            return self._fitting(begin, middle) + self._fitting(middle, end)
+        check_fits(size, self._max_bytes)
+        return [rows]
+
+    def _bytes(self, rows: _Rows, per_entry: int) -> int:
+        """What the lists of a row slice take."""
+        return rows.entries * per_entry + (rows.end - rows.begin) * self._columns * SIZE * SIZE * 4
+
+    def _number_kept(self) -> int:
+        """How many row slices can be kept from forward to backward beside the one that is being made."""
+        room = self._max_bytes - max(self._bytes(rows, _PER_ENTRY) for rows in self._slices)
+        totals = accumulate(self._bytes(rows, _KEPT_PER_ENTRY) for rows in self._slices)
+        number = sum(total <= room for total in totals)
+        return number + (number == len(self._slices) - 1)  # beside the last none is made
 
     def _tiles(self, rows: _Rows) -> tuple[int, ...]:
         """How the tiles of a row slice lie in the images."""

@@ -233,80 +233,100 @@ def composite_backward(
         chunk -= 1
 
 
+@triton.jit
+def _column(values, i: tl.constexpr):
+    """Column i of four."""
+    return tl.sum(tl.where(tl.arange(0, 4)[None, :] == i, values, 0.0), 1)
+
+
 @triton.jit(do_not_specialize=["f0", "n"])
 def sum_entries(
     order, begins, moments, factors, opacities, eps2d, n, channels, f0, d_means2d, d_factors, d_opacities, d_features,
     d_absolute,
     MOMENTS: tl.constexpr, WITH_FEATURES: tl.constexpr, ABSOLUTE: tl.constexpr,
-    ADD: tl.constexpr, ADD_FEATURES: tl.constexpr, BLOCK: tl.constexpr, STRIDE: tl.constexpr,
+    ADD: tl.constexpr, ADD_FEATURES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Add up the rows of each Gaussian, and turn its moments into gradients: `kgs.covariance.moment_gradients`.
 
-    A Gaussian's rows lie side by side, from `begins[i]` on. `ADD` adds to the gradients that are there: of another
-    block of features, or of another row slice.
+    A Gaussian's rows lie side by side, from `begins[i]` on. A lane adds up those of one Gaussian, four numbers at a
+    time; where a few Gaussians of a block have most of its rows, all lanes add up those of each. `ADD` adds to the
+    gradients that are there, of another block of features or of another row slice, where there is something to add.
     """
-    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    lane = tl.arange(0, BLOCK)
+    i = tl.program_id(0) * BLOCK + lane
     inside = i < n
     begin = tl.load(begins + i, mask=inside, other=0)
-    end = tl.load(begins + i + 1, mask=inside, other=0)
-    zero = tl.zeros((BLOCK,), tl.float32)
-    s0, sx, sy, sxx, sxy, syy = zero, zero, zero, zero, zero, zero
-    c0, c1, c2, c3, ux, uy = zero, zero, zero, zero, zero, zero
-    at = begin[:, None] + tl.arange(0, STRIDE)[None, :]
-    left = tl.max(end - begin, 0)
-    while left > 0:
-        row = moments + at * _ROW
-        there = at < end[:, None]
-        if MOMENTS:
-            s0 += tl.sum(tl.load(row, mask=there, other=0.0), 1)
-            sx += tl.sum(tl.load(row + 1, mask=there, other=0.0), 1)
-            sy += tl.sum(tl.load(row + 2, mask=there, other=0.0), 1)
-            sxx += tl.sum(tl.load(row + 3, mask=there, other=0.0), 1)
-            sxy += tl.sum(tl.load(row + 4, mask=there, other=0.0), 1)
-            syy += tl.sum(tl.load(row + 5, mask=there, other=0.0), 1)
-        if WITH_FEATURES:
-            c0 += tl.sum(tl.load(row + 6, mask=there, other=0.0), 1)
-            c1 += tl.sum(tl.load(row + 7, mask=there, other=0.0), 1)
-            c2 += tl.sum(tl.load(row + 8, mask=there, other=0.0), 1)
-            c3 += tl.sum(tl.load(row + 9, mask=there, other=0.0), 1)
-        if ABSOLUTE:
-            ux += tl.sum(tl.load(row + 10, mask=there, other=0.0), 1)
-            uy += tl.sum(tl.load(row + 11, mask=there, other=0.0), 1)
-        at += STRIDE
-        left -= STRIDE
+    count = (tl.load(begins + i + 1, mask=inside, other=0) - begin).to(tl.int32)
+    limit = tl.minimum(16 + tl.sum(count, 0) // 8, 256)
+    short = count <= limit
+    number = tl.arange(0, 4)[None, :]
+    sums0 = tl.zeros((BLOCK, 4), tl.float32)
+    sums1, sums2 = sums0, sums0
+    rows = moments + begin[:, None] * _ROW + number
+    longest = tl.max(tl.where(short, count, 0), 0)
+    k = 0
+    while k < longest:
+        there = (short & (k < count))[:, None]
+        sums0 += tl.load(rows, mask=there, other=0.0)
+        sums1 += tl.load(rows + 4, mask=there, other=0.0)
+        sums2 += tl.load(rows + 8, mask=there, other=0.0)
+        rows += _ROW
+        k += 1
+    one = tl.min(tl.where(short, BLOCK, lane), 0)
+    while one < BLOCK:
+        part0 = tl.zeros((BLOCK, 4), tl.float32)
+        part1, part2 = part0, part0
+        left = tl.sum(tl.where(lane == one, count, 0), 0)
+        rows = moments + (tl.sum(tl.where(lane == one, begin, 0), 0) + lane)[:, None] * _ROW + number
+        while left > 0:
+            there = (lane < left)[:, None]
+            part0 += tl.load(rows, mask=there, other=0.0)
+            part1 += tl.load(rows + 4, mask=there, other=0.0)
+            part2 += tl.load(rows + 8, mask=there, other=0.0)
+            rows += BLOCK * _ROW
+            left -= BLOCK
+        here = (lane == one)[:, None]
+        sums0 += tl.where(here, tl.sum(part0, 0)[None, :], 0.0)
+        sums1 += tl.where(here, tl.sum(part1, 0)[None, :], 0.0)
+        sums2 += tl.where(here, tl.sum(part2, 0)[None, :], 0.0)
+        one = tl.min(tl.where(short | (lane <= one), BLOCK, lane), 0)
+    listed = count > 0
+    written = listed if ADD else inside
     g = tl.load(order + i, mask=inside, other=0)
     if WITH_FEATURES:
         out = d_features + g * channels + f0
-        put(out, c0, inside & _exists(f0, channels, i), ADD_FEATURES)
-        put(out + 1, c1, inside & _exists(f0 + 1, channels, i), ADD_FEATURES)
-        put(out + 2, c2, inside & _exists(f0 + 2, channels, i), ADD_FEATURES)
-        put(out + 3, c3, inside & _exists(f0 + 3, channels, i), ADD_FEATURES)
+        some = listed if ADD_FEATURES else inside
+        put(out, _column(sums1, 2), some & _exists(f0, channels, i), ADD_FEATURES)
+        put(out + 1, _column(sums1, 3), some & _exists(f0 + 1, channels, i), ADD_FEATURES)
+        put(out + 2, _column(sums2, 0), some & _exists(f0 + 2, channels, i), ADD_FEATURES)
+        put(out + 3, _column(sums2, 1), some & _exists(f0 + 3, channels, i), ADD_FEATURES)
     if ABSOLUTE:
-        put(d_absolute + g * 2, ux, inside, ADD)
-        put(d_absolute + g * 2 + 1, uy, inside, ADD)
+        put(d_absolute + g * 2, _column(sums2, 2), written, ADD)
+        put(d_absolute + g * 2 + 1, _column(sums2, 3), written, ADD)
     if MOMENTS:
-        a0, a1, a2, b0, b1, b2 = load_factors(factors, g, inside)
+        s0, sx, sy, sxx = _column(sums0, 0), _column(sums0, 1), _column(sums0, 2), _column(sums0, 3)
+        sxy, syy = _column(sums1, 0), _column(sums1, 1)
+        a0, a1, a2, b0, b1, b2 = load_factors(factors, g, written)
         xx, xy, yy, det = variances(a0, a1, a2, b0, b1, b2, eps2d)
-        opacity = tl.load(opacities + g, mask=inside, other=1.0)
-        listed = end > begin
-        put(d_opacities + g, tl.where(listed, s0 / opacity, 0.0), inside, ADD)
+        opacity = tl.load(opacities + g, mask=written, other=1.0)
+        put(d_opacities + g, tl.where(listed, s0 / opacity, 0.0), written, ADD)
         curved = listed & is_finite(det)  # else it overflows: flat over the image
         r = 1.0 / det
-        put(d_means2d + g * 2, tl.where(curved, (yy * sx - xy * sy) * r, 0.0), inside, ADD)
-        put(d_means2d + g * 2 + 1, tl.where(curved, (xx * sy - xy * sx) * r, 0.0), inside, ADD)
+        put(d_means2d + g * 2, tl.where(curved, (yy * sx - xy * sy) * r, 0.0), written, ADD)
+        put(d_means2d + g * 2 + 1, tl.where(curved, (xx * sy - xy * sx) * r, 0.0), written, ADD)
         u, v, w = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
         # det Q M without cancellation: rows e a + b x w and e b + w x a
         x0, x1, x2 = eps2d * a0 + b1 * w - b2 * v, eps2d * a1 + b2 * u - b0 * w, eps2d * a2 + b0 * v - b1 * u
         y0, y1, y2 = eps2d * b0 + v * a2 - w * a1, eps2d * b1 + w * a0 - u * a2, eps2d * b2 + u * a1 - v * a0
-        _put_factors(d_factors + g * 6, x0, y0, r, xx, xy, yy, sxx, sxy, syy, curved, inside, ADD)
-        _put_factors(d_factors + g * 6 + 1, x1, y1, r, xx, xy, yy, sxx, sxy, syy, curved, inside, ADD)
-        _put_factors(d_factors + g * 6 + 2, x2, y2, r, xx, xy, yy, sxx, sxy, syy, curved, inside, ADD)
+        _put_factors(d_factors + g * 6, x0, y0, r, xx, xy, yy, sxx, sxy, syy, curved, written, ADD)
+        _put_factors(d_factors + g * 6 + 1, x1, y1, r, xx, xy, yy, sxx, sxy, syy, curved, written, ADD)
+        _put_factors(d_factors + g * 6 + 2, x2, y2, r, xx, xy, yy, sxx, sxy, syy, curved, written, ADD)
 
 
 @triton.jit
-def _put_factors(out, x, y, r, xx, xy, yy, sxx, sxy, syy, curved, inside, ADD: tl.constexpr):
+def _put_factors(out, x, y, r, xx, xy, yy, sxx, sxy, syy, curved, written, ADD: tl.constexpr):
     """A column of dL/dM: Q S Q M of the second moments S, where x and y are a column of det Q M."""
     x, y = x * r, y * r
     m, n = sxx * x + sxy * y, sxy * x + syy * y
-    put(out, tl.where(curved, (yy * m - xy * n) * r, 0.0), inside, ADD)
-    put(out + 3, tl.where(curved, (xx * n - xy * m) * r, 0.0), inside, ADD)
+    put(out, tl.where(curved, (yy * m - xy * n) * r, 0.0), written, ADD)
+    put(out + 3, tl.where(curved, (xx * n - xy * m) * r, 0.0), written, ADD)

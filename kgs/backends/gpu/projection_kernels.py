@@ -16,8 +16,8 @@ import triton
 import triton.language as tl
 
 from .camera_kernels import COVERED, CUTOFF, WIDTH
-from .footprint_kernels import is_finite, load_factors, put, variances
-from .harmonics_kernels import basis, basis_gradient, evaluate
+from .footprint_kernels import is_finite, load_factors, load_four, put, put_four, variances
+from .harmonics_kernels import basis, basis_gradient, evaluate, load_bands
 
 _WIDTH: tl.constexpr = tl.constexpr(WIDTH)
 _COVERED: tl.constexpr = tl.constexpr(COVERED)
@@ -103,10 +103,7 @@ def _to_camera(camera, x, y, z):
 @triton.jit
 def _rotation(quats, g, inside):
     """Unit quaternion, 1 / norm, rotation matrix by rows; the zero quaternion turns nothing and gets no gradient."""
-    w = tl.load(quats + g * 4, mask=inside, other=0.0)
-    x = tl.load(quats + g * 4 + 1, mask=inside, other=0.0)
-    y = tl.load(quats + g * 4 + 2, mask=inside, other=0.0)
-    z = tl.load(quats + g * 4 + 3, mask=inside, other=0.0)
+    w, x, y, z = load_four(quats + g * 4, inside)
     peak = tl.maximum(tl.maximum(tl.abs(w), tl.abs(x)), tl.maximum(tl.abs(y), tl.abs(z)))
     turns = peak > 0.0
     scale = tl.where(turns, peak, 1.0)  # no square overflows or vanishes
@@ -328,33 +325,51 @@ def _limit_gradients(camera, x, y, inverse, h02, h12):
 
 
 @triton.jit
+def _by_direction(gx, gy, gz, x, y, z, red, green, blue, r, g, b, k: tl.constexpr):
+    """Add to dL/d direction what band k, with colour (r, g, b), contributes; the first contributes nothing."""
+    if k > 0:
+        bx, by, bz = basis_gradient(x, y, z, red * r + green * g + blue * b, k)
+        gx, gy, gz = gx + bx, gy + by, gz + bz
+    return gx, gy, gz
+
+
+@triton.jit
 def _color_gradients(
-    camera, mx, my, mz, colors, g, visible, g_rgb, m, d_colors, inside,
+    camera, mx, my, mz, colors, g, visible, red, green, blue, d_colors, written,
     BANDS: tl.constexpr, WRITE: tl.constexpr, ADD: tl.constexpr,
 ):  # fmt: skip
-    """The colour's contribution to the gradient of the centre.
+    """The colour's contribution to the gradient of the centre, from that of red, green and blue.
 
     With `WRITE` the gradients of the harmonics are stored, or with `ADD` added to what is there.
     """
     x, y, z, inverse = _direction(camera, mx, my, mz)
-    red, green, blue = evaluate(colors, g, visible, x, y, z, BANDS)
-    red = tl.where(red < 0.0, 0.0, tl.load(g_rgb + m * 3, mask=visible, other=0.0))
-    green = tl.where(green < 0.0, 0.0, tl.load(g_rgb + m * 3 + 1, mask=visible, other=0.0))
-    blue = tl.where(blue < 0.0, 0.0, tl.load(g_rgb + m * 3 + 2, mask=visible, other=0.0))
+    x, y, z = tl.where(visible, x, 0.0), tl.where(visible, y, 0.0), tl.where(visible, z, 0.0)
+    r, g_, b = evaluate(colors, g, visible, x, y, z, BANDS)
+    red, green, blue = tl.where(r < 0.0, 0.0, red), tl.where(g_ < 0.0, 0.0, green), tl.where(b < 0.0, 0.0, blue)
     gx, gy, gz = red * 0.0, red * 0.0, red * 0.0
     row = g.to(tl.int64) * (3 * BANDS)
-    for k in tl.static_range(BANDS):
+    out = d_colors + row
+    for k in tl.static_range(0, BANDS // 4 * 4, 4):
         if WRITE:
-            b = tl.where(visible, basis(x, y, z, k), 0.0)
-            put(d_colors + row + 3 * k, b * red, inside, ADD)
-            put(d_colors + row + 3 * k + 1, b * green, inside, ADD)
-            put(d_colors + row + 3 * k + 2, b * blue, inside, ADD)
-        if k > 0:
-            h = red * tl.load(colors + row + 3 * k, mask=visible, other=0.0)
-            h += green * tl.load(colors + row + 3 * k + 1, mask=visible, other=0.0)
-            h += blue * tl.load(colors + row + 3 * k + 2, mask=visible, other=0.0)
-            bx, by, bz = basis_gradient(x, y, z, h, k)
-            gx, gy, gz = gx + bx, gy + by, gz + bz
+            v0, v1, v2, v3 = basis(x, y, z, k), basis(x, y, z, k + 1), basis(x, y, z, k + 2), basis(x, y, z, k + 3)
+            put_four(out + 3 * k, v0 * red, v0 * green, v0 * blue, v1 * red, written, ADD)
+            put_four(out + 3 * k + 4, v1 * green, v1 * blue, v2 * red, v2 * green, written, ADD)
+            put_four(out + 3 * k + 8, v2 * blue, v3 * red, v3 * green, v3 * blue, written, ADD)
+        r0, g0, b0, r1, g1, b1, r2, g2, b2, r3, g3, b3 = load_bands(colors + row + 3 * k, visible)
+        gx, gy, gz = _by_direction(gx, gy, gz, x, y, z, red, green, blue, r0, g0, b0, k)
+        gx, gy, gz = _by_direction(gx, gy, gz, x, y, z, red, green, blue, r1, g1, b1, k + 1)
+        gx, gy, gz = _by_direction(gx, gy, gz, x, y, z, red, green, blue, r2, g2, b2, k + 2)
+        gx, gy, gz = _by_direction(gx, gy, gz, x, y, z, red, green, blue, r3, g3, b3, k + 3)
+    for k in tl.static_range(BANDS // 4 * 4, BANDS):
+        if WRITE:
+            v = basis(x, y, z, k)
+            put(out + 3 * k, v * red, written, ADD)
+            put(out + 3 * k + 1, v * green, written, ADD)
+            put(out + 3 * k + 2, v * blue, written, ADD)
+        r = tl.load(colors + row + 3 * k, mask=visible, other=0.0)
+        g_ = tl.load(colors + row + 3 * k + 1, mask=visible, other=0.0)
+        b = tl.load(colors + row + 3 * k + 2, mask=visible, other=0.0)
+        gx, gy, gz = _by_direction(gx, gy, gz, x, y, z, red, green, blue, r, g_, b, k)
     along = gx * x + gy * y + gz * z
     return (gx - along * x) * inverse, (gy - along * y) * inverse, (gz - along * z) * inverse
 
@@ -385,13 +400,30 @@ def footprint_gradients(
     """From gradients of what camera c sees to those of all Gaussians; `ADD`: added to those by the cameras before.
 
     With `WITH_CAMERA` also those of the camera, `totals` of each block of Gaussians: pose (3, 4), intrinsics (3, 3).
-    Without `WITH_DEPTHS` those of the depths are 0.
+    Without `WITH_DEPTHS` those of the depths are 0. Of a Gaussian whose gradients are all 0, as of what lies behind an
+    opaque surface, nothing is read.
     """
     b = tl.program_id(0)
     camera = cameras + c * _WIDTH
     g = b * BLOCK + tl.arange(0, BLOCK)
     inside = g < n
     visible, m = _rows(flags, counts, b, c, g, n, inside, blocks)
+    t0, t1, t2, t3, t4, t5 = load_factors(g_factors, m, visible)
+    g_u = tl.load(g_means2d + m * 2, mask=visible, other=0.0)
+    g_v = tl.load(g_means2d + m * 2 + 1, mask=visible, other=0.0)
+    alpha = tl.load(g_alphas + m, mask=visible, other=0.0)
+    g_depth = tl.zeros((BLOCK,), tl.float32)
+    if WITH_DEPTHS:
+        g_depth = tl.load(g_depths + m, mask=visible, other=0.0)
+    red, green, blue = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
+    if BANDS > 0:
+        red = tl.load(g_rgb + m * 3, mask=visible, other=0.0)
+        green = tl.load(g_rgb + m * 3 + 1, mask=visible, other=0.0)
+        blue = tl.load(g_rgb + m * 3 + 2, mask=visible, other=0.0)
+    total = tl.abs(t0) + tl.abs(t1) + tl.abs(t2) + tl.abs(t3) + tl.abs(t4) + tl.abs(t5) + tl.abs(g_u) + tl.abs(g_v)
+    total += tl.abs(alpha) + tl.abs(g_depth) + tl.abs(red) + tl.abs(green) + tl.abs(blue)
+    visible = visible & (total != 0.0)  # what is not a number stays
+    written = visible if ADD else inside
     mx, my, mz, x, y, z = _camera_point(camera, means, g, visible)
     z = tl.where(visible, z, 1.0)
     inverse = 1.0 / z
@@ -400,42 +432,32 @@ def footprint_gradients(
     b0, b1, b2 = _to_world(camera, j10, j11, j12)
     qw, qx, qy, qz, by_norm, r00, r01, r02, r10, r11, r12, r20, r21, r22 = _rotation(quats, g, visible)
     f0, f1, f2, f3, f4, f5 = _turned(a0, a1, a2, b0, b1, b2, r00, r01, r02, r10, r11, r12, r20, r21, r22)
-    t0, t1, t2, t3, t4, t5 = load_factors(g_factors, m, visible)
-    put(d_scales + g * 3, t0 * f0 + t3 * f3, inside, ADD)
-    put(d_scales + g * 3 + 1, t1 * f1 + t4 * f4, inside, ADD)
-    put(d_scales + g * 3 + 2, t2 * f2 + t5 * f5, inside, ADD)
+    put(d_scales + g * 3, t0 * f0 + t3 * f3, written, ADD)
+    put(d_scales + g * 3 + 1, t1 * f1 + t4 * f4, written, ADD)
+    put(d_scales + g * 3 + 2, t2 * f2 + t5 * f5, written, ADD)
     s0 = tl.load(scales + g * 3, mask=visible, other=0.0)
     s1 = tl.load(scales + g * 3 + 1, mask=visible, other=0.0)
     s2 = tl.load(scales + g * 3 + 2, mask=visible, other=0.0)
     t0, t1, t2, t3, t4, t5 = t0 * s0, t1 * s1, t2 * s2, t3 * s0, t4 * s1, t5 * s2
     dw, dx, dy, dz = _quaternion_gradient(qw, qx, qy, qz, by_norm, a0, a1, a2, b0, b1, b2, t0, t1, t2, t3, t4, t5)
-    put(d_quats + g * 4, dw, inside, ADD)
-    put(d_quats + g * 4 + 1, dx, inside, ADD)
-    put(d_quats + g * 4 + 2, dy, inside, ADD)
-    put(d_quats + g * 4 + 3, dz, inside, ADD)
+    put_four(d_quats + g * 4, dw, dx, dy, dz, written, ADD)
     u0, u1, u2, v0, v1, v2 = _turned_back(t0, t1, t2, t3, t4, t5, r00, r01, r02, r10, r11, r12, r20, r21, r22)
-    g_u = tl.load(g_means2d + m * 2, mask=visible, other=0.0)
-    g_v = tl.load(g_means2d + m * 2 + 1, mask=visible, other=0.0)
-    g_depth = tl.zeros((BLOCK,), tl.float32)
-    if WITH_DEPTHS:
-        g_depth = tl.load(g_depths + m, mask=visible, other=0.0)
     gx, gy, gz, h00, h01, h02, h10, h11, h12 = _point_gradient(
         camera, x, y, z, u0, u1, u2, v0, v1, v2, g_u, g_v, g_depth
     )
     wx, wy, wz = gx * 0.0, gx * 0.0, gx * 0.0
     if BANDS > 0:
         wx, wy, wz = _color_gradients(
-            camera, mx, my, mz, colors, g, visible, g_rgb, m, d_colors, inside, BANDS, WITH_COLORS, ADD
+            camera, mx, my, mz, colors, g, visible, red, green, blue, d_colors, written, BANDS, WITH_COLORS, ADD
         )
     px, py, pz = _to_world(camera, gx, gy, gz)
-    put(d_means + g * 3, tl.where(visible, px + wx, 0.0), inside, ADD)
-    put(d_means + g * 3 + 1, tl.where(visible, py + wy, 0.0), inside, ADD)
-    put(d_means + g * 3 + 2, tl.where(visible, pz + wz, 0.0), inside, ADD)
-    alpha = tl.load(g_alphas + m, mask=visible, other=0.0)
+    put(d_means + g * 3, tl.where(visible, px + wx, 0.0), written, ADD)
+    put(d_means + g * 3 + 1, tl.where(visible, py + wy, 0.0), written, ADD)
+    put(d_means + g * 3 + 2, tl.where(visible, pz + wz, 0.0), written, ADD)
     view = 0
     while view < views:  # each has its own opacities, or all have one
         own = (views == 1) | (view == c)
-        put(d_opacities + view * n + g, tl.where(own, alpha, 0.0), inside, ADD)
+        put(d_opacities + view * n + g, tl.where(own, alpha, 0.0), written, ADD)
         view += 1
     if WITH_CAMERA:
         out = totals + b * 21

@@ -20,6 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from kgs.backends.base import CompositingCall, CompositingInputs, Compositor, Images
+from kgs.backends.row_slices import MAX_BYTES
 from kgs.covariance import footprint_table, moment_gradients
 from kgs.types import RasterOptions
 
@@ -54,8 +55,9 @@ class TorchCompositor(Compositor):
         tile_size = options.tile_size or 8
         number = features.element_size()
         arrays = _ARRAYS + 3 * options.absgrad
-        step_bytes = min(self._settings.pairs * arrays * number, options.max_bytes // 4)
-        budget = options.max_bytes - step_bytes
+        max_bytes = options.max_bytes or MAX_BYTES
+        step_bytes = min(self._settings.pairs * arrays * number, max_bytes // 4)
+        budget = max_bytes - step_bytes
         # working memory of a Gaussian in a row of tiles; and in a tile: lists, sorting, gradients, sum, saved T
         width = 8 + 2 * features.shape[1] + 4 * options.absgrad + tile_size**2 // 8
         per_span = 32 + 16 * number
