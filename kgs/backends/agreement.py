@@ -22,15 +22,19 @@ _OPTIONS = RasterOptions(tile_size=8, alpha_threshold=1e-6, transmittance_stop=1
 def disagreement(backend: Backend, device: torch.device) -> float:
     """The largest difference from torch in float64, over the largest value of its kind.
 
-    Of a training step of 32 Gaussians before two cameras: harmonics of degree 3, a stack of opaque Gaussians, five
-    features, the loss; the gradients of all Gaussians, of poses and intrinsics, and of the image.
+    Of activations, and of a training step of 32 Gaussians before two cameras: harmonics of degree 3, a stack of opaque
+    Gaussians, five features, the loss; the gradients of all parameters, of poses and intrinsics, and of the image.
 
     Args:
         backend: works in float32 on the device.
         device: where; torch is on the CPU where it has no float64 there.
     """
     reference_device = device if device.type in ("cpu", "cuda") else torch.device("cpu")
-    pairs = list(zip(_render(backend, device), _render(TorchBackend(), reference_device), strict=True))
+    found, expected = (
+        [*_activate(one, where), *_render(one, where)]
+        for one, where in ((backend, device), (TorchBackend(), reference_device))
+    )
+    pairs = list(zip(found, expected, strict=True))
     if backend.has_loss:
         pairs += zip(_loss(backend, device), _exact_loss(), strict=True)
     return max(_relative(value, expected) for value, expected in pairs)
@@ -43,9 +47,24 @@ def _random(*shape: int, low: float = -1.0, high: float = 1.0, seed: int = 0) ->
     return (unit * (high - low) + low).double()
 
 
+def _dtype(backend: Backend) -> torch.dtype:
+    """Float64 of torch, which defines what is right."""
+    return torch.float64 if isinstance(backend, TorchBackend) else torch.float32
+
+
+def _activate(backend: Backend, device: torch.device) -> list[Tensor]:
+    """Scales, opacities and harmonics, and the gradients of what they are made of."""
+    values = (_random(8, 3, low=-8.0), _random(8, low=-8.0, high=8.0), _random(8, 1, 3), _random(8, 15, 3, seed=1))
+    leaves = [x.to(device, _dtype(backend)).requires_grad_() for x in values]
+    log_scales, opacity_logits, sh_dc, sh_rest = leaves
+    activated = backend.activate(log_scales, opacity_logits, sh_dc, sh_rest, 9)
+    weights = [_random(*x.shape, seed=2).to(x) for x in activated]
+    return [*activated, *torch.autograd.grad(activated, leaves, weights)]
+
+
 def _render(backend: Backend, device: torch.device) -> list[Tensor]:
-    """Image, depth and transmittance, and the gradients of all inputs; float64 from torch, else float32."""
-    dtype = torch.float64 if isinstance(backend, TorchBackend) else torch.float32
+    """Image, depth and transmittance, and the gradients of all inputs."""
+    dtype = _dtype(backend)
     n = 32
     width, height = 16, 12
     means = (_random(n, 3) + torch.tensor([0.0, 0.0, 3.0], device="cpu")).float()

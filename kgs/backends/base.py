@@ -13,6 +13,18 @@ from kgs.camera import Cameras
 from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
 
 
+class ActivationStage(Protocol):
+    """The stage of :class:`kgs.GaussianModel`."""
+
+    def __call__(
+        self, log_scales: Tensor, opacity_logits: Tensor, sh_dc: Tensor, sh_rest: Tensor, bands: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Scales, infinite and without gradient where they overflow, opacities, and harmonics `(N, bands, 3)`.
+
+        With 1 band the latter are `sh_dc` itself; the gradient of `sh_rest` is 0 in bands that are not asked for.
+        """
+
+
 class ProjectionStage(Protocol):
     """The stage of :func:`kgs.project`."""
 
@@ -162,6 +174,11 @@ class Backend(ABC):
     def covers_compositing(self, call: CompositingCall) -> bool:
         """Whether it composites with these options; cheap, reads no values of tensors."""
         return True
+
+    @property
+    @abstractmethod
+    def activate(self) -> ActivationStage:
+        """Its activations."""
 
     @property
     @abstractmethod

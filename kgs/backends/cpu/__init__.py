@@ -23,7 +23,15 @@ Rules that keep the kernels fast. Breaking any of them cost a measured factor of
 
 import torch
 
-from kgs.backends.base import Backend, CompositingCall, Compositor, LossStage, MomentsStage, ProjectionStage
+from kgs.backends.base import (
+    ActivationStage,
+    Backend,
+    CompositingCall,
+    Compositor,
+    LossStage,
+    MomentsStage,
+    ProjectionStage,
+)
 
 
 class CpuBackend(Backend):
@@ -42,6 +50,13 @@ class CpuBackend(Backend):
         narrow = call.projected.image_size[1] <= 2**18 - 8  # columns of tiles, and how many, are numbers of 15 bits
         one_block = not call.options.absgrad or call.features.shape[1] <= 8
         return call.options.tile_size in (None, self.tile_size) and call.chunk_size is None and narrow and one_block
+
+    @property
+    def activate(self) -> ActivationStage:
+        """See `Backend.activate`."""
+        from kgs.backends.torch.activation import activate
+
+        return activate
 
     @property
     def project(self) -> ProjectionStage:

@@ -1,10 +1,10 @@
 """The backend of Triton kernels, for float32 on GPUs.
 
-`projection_kernels`, `compositing_kernels` and `loss_kernels` have the kernels of a stage, and `projection`,
-`compositing` and `loss` bring them to torch; the other files of kernels are parts of these. `launch` calls them, and
-`entry_counts` tells compositing what projection has counted. Torch defines what is right; a kernel gives the same
-within the rounding of float32, and its formulas are explained in the torch code that it follows. `import kgs` does not
-import triton: a stage is imported when it is first used.
+`activation`, `projection`, `compositing` and `loss` bring the kernels of a stage to torch, which stand in the file of
+kernels beside it; the other files of kernels are parts of these. `launch` calls them, and `entry_counts` tells
+compositing what projection has counted. Torch defines what is right; a kernel gives the same within the rounding of
+float32, and its formulas are explained in the torch code that it follows. `import kgs` does not import triton: a stage
+is imported when it is first used.
 
 With TRITON_INTERPRET=1 in the environment the kernels run on a CPU, slowly: so they are tested without a GPU.
 
@@ -26,7 +26,7 @@ import os
 import torch
 
 from kgs._support.errors import warn
-from kgs.backends.base import Backend, CompositingCall, Compositor, LossStage, ProjectionStage
+from kgs.backends.base import ActivationStage, Backend, CompositingCall, Compositor, LossStage, ProjectionStage
 
 
 class GpuBackend(Backend):
@@ -57,6 +57,13 @@ class GpuBackend(Backend):
         """Only its own tile size, no `chunk_size`, and of many features no `absgrad`: blocks would be added up."""
         one_block = not call.options.absgrad or call.features.shape[1] <= 4
         return call.options.tile_size in (None, self.tile_size) and call.chunk_size is None and one_block
+
+    @property
+    def activate(self) -> ActivationStage:
+        """See `Backend.activate`."""
+        from .activation import activate
+
+        return activate
 
     @property
     def project(self) -> ProjectionStage:

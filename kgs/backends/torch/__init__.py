@@ -29,8 +29,9 @@ slices, nearest first, with lists only for tiles that are not yet opaque: hidden
 
 from torch import Tensor
 
-from kgs.backends.base import Backend, Compositor, ProjectionStage
+from kgs.backends.base import ActivationStage, Backend, Compositor, ProjectionStage
 
+from .activation import activate
 from .compositing import TorchCompositor
 from .projection import project
 
@@ -43,6 +44,11 @@ class TorchBackend(Backend):
     def covers(self, like: Tensor) -> bool:
         """Every call."""
         return True
+
+    @property
+    def activate(self) -> ActivationStage:
+        """See `Backend.activate`."""
+        return activate
 
     @property
     def project(self) -> ProjectionStage:
