@@ -22,8 +22,9 @@ _OPTIONS = RasterOptions(tile_size=8, alpha_threshold=1e-6, transmittance_stop=1
 def disagreement(backend: Backend, device: torch.device) -> float:
     """The largest difference from torch in float64, over the largest value of its kind.
 
-    Of activations, and of a training step of 32 Gaussians before two cameras: harmonics of degree 3, a stack of opaque
-    Gaussians, five features, the loss; the gradients of all parameters, of poses and intrinsics, and of the image.
+    Of a training step of 32 Gaussians before two cameras: harmonics of degree 3, a stack of opaque Gaussians, five
+    features, a background, the loss; the gradients of all Gaussians, of poses and intrinsics, and of the image; and of
+    activations.
 
     Args:
         backend: works in float32 on the device.
@@ -31,7 +32,7 @@ def disagreement(backend: Backend, device: torch.device) -> float:
     """
     reference_device = device if device.type in ("cpu", "cuda") else torch.device("cpu")
     found, expected = (
-        [*_activate(one, where), *_render(one, where)]
+        [*_activate(one, where), *_render(one, where), *_blend(one, where)]
         for one, where in ((backend, device), (TorchBackend(), reference_device))
     )
     pairs = list(zip(found, expected, strict=True))
@@ -60,6 +61,15 @@ def _activate(backend: Backend, device: torch.device) -> list[Tensor]:
     activated = backend.activate(log_scales, opacity_logits, sh_dc, sh_rest, 9)
     weights = [_random(*x.shape, seed=2).to(x) for x in activated]
     return [*activated, *torch.autograd.grad(activated, leaves, weights)]
+
+
+def _blend(backend: Backend, device: torch.device) -> list[Tensor]:
+    """Images over a colour, and the gradients of images and transmittance."""
+    values = (_random(2, 5, 6, 7), _random(2, 1, 6, 7, low=0.0, seed=1))
+    leaves = [x.to(device, _dtype(backend)).requires_grad_() for x in values]
+    image, transmittance = leaves
+    blended = backend.blend(image, transmittance, _random(5, 1, 1).to(image))
+    return [blended, *torch.autograd.grad(blended, leaves, _random(2, 5, 6, 7, seed=2).to(blended))]
 
 
 def _render(backend: Backend, device: torch.device) -> list[Tensor]:

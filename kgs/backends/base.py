@@ -103,6 +103,17 @@ class Compositor(ABC):
         """
 
 
+class BlendingStage(Protocol):
+    """The last stage of a render."""
+
+    def __call__(self, image: Tensor, transmittance: Tensor, background: Tensor) -> Tensor:
+        """The image `(C, D, H, W)` plus the transmittance `(C, 1, H, W)` times the background.
+
+        The background is `(D, 1, 1)`, or of any shape that can be expanded to the image's. Where the transmittance is
+        0 nothing is added, of an infinite background too.
+        """
+
+
 class LossStage(Protocol):
     """The stage of :func:`kgs.losses.photometric_loss`."""
 
@@ -189,6 +200,11 @@ class Backend(ABC):
     @abstractmethod
     def compositor(self) -> type[Compositor]:
         """Its compositing."""
+
+    @property
+    @abstractmethod
+    def blend(self) -> BlendingStage:
+        """Its blending with a background."""
 
     @property
     def loss_and_gradient(self) -> LossStage:

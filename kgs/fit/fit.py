@@ -105,7 +105,7 @@ class Fit:
         if gains is None:
             return rendering.image, rendering
         exposed = rendering.image * gains.to(rendering.image)[:, None, None]
-        return blend(exposed, 1.0 - rendering.alpha, self._background), rendering
+        return blend(exposed, 1.0 - rendering.alpha, self._background, self.backend), rendering
 
     @torch.no_grad()
     def median_depth(self, camera: PinholeCamera) -> Tensor:

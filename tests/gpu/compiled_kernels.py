@@ -112,7 +112,7 @@ def _render_every_form():
     per_camera = replace(single, opacities=single.opacities.repeat(2, 1))
     for some, max_bytes in ((single, 2**17), (per_camera, 2**30)):
         renderer = GaussianRenderer(backend="triton", absgrad=True, max_bytes=max_bytes)
-        renderer(some, cameras, outputs=("image", "median_depth")).image.square().sum().backward()
+        renderer(some, cameras, torch.rand(3), ("image", "median_depth")).image.square().sum().backward()
     features = replace(single, colors=torch.rand(40, 9, requires_grad=True))
     GaussianRenderer(backend="triton")(features, cameras).image.square().sum().backward()
 

@@ -26,6 +26,7 @@ import torch
 from kgs.backends.base import (
     ActivationStage,
     Backend,
+    BlendingStage,
     CompositingCall,
     Compositor,
     LossStage,
@@ -71,6 +72,13 @@ class CpuBackend(Backend):
         from .compositing import CpuCompositor
 
         return CpuCompositor
+
+    @property
+    def blend(self) -> BlendingStage:
+        """See `Backend.blend`."""
+        from kgs.backends.torch.blending import blend
+
+        return blend
 
     @property
     def loss_and_gradient(self) -> LossStage:

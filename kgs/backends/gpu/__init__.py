@@ -1,10 +1,10 @@
 """The backend of Triton kernels, for float32 on GPUs.
 
-`activation`, `projection`, `compositing` and `loss` bring the kernels of a stage to torch, which stand in the file of
-kernels beside it; the other files of kernels are parts of these. `launch` calls them, and `entry_counts` tells
-compositing what projection has counted. Torch defines what is right; a kernel gives the same within the rounding of
-float32, and its formulas are explained in the torch code that it follows. `import kgs` does not import triton: a stage
-is imported when it is first used.
+`activation`, `projection`, `compositing`, `blending` and `loss` bring the kernels of a stage to torch, which stand in
+the file of kernels beside it; the other files of kernels are parts of these. `launch` calls them, and `entry_counts`
+tells compositing what projection has counted. Torch defines what is right; a kernel gives the same within the rounding
+of float32, and its formulas are explained in the torch code that it follows. `import kgs` does not import triton: a
+stage is imported when it is first used.
 
 With TRITON_INTERPRET=1 in the environment the kernels run on a CPU, slowly: so they are tested without a GPU.
 
@@ -26,7 +26,15 @@ import os
 import torch
 
 from kgs._support.errors import warn
-from kgs.backends.base import ActivationStage, Backend, CompositingCall, Compositor, LossStage, ProjectionStage
+from kgs.backends.base import (
+    ActivationStage,
+    Backend,
+    BlendingStage,
+    CompositingCall,
+    Compositor,
+    LossStage,
+    ProjectionStage,
+)
 
 
 class GpuBackend(Backend):
@@ -78,6 +86,13 @@ class GpuBackend(Backend):
         from .compositing import GpuCompositor
 
         return GpuCompositor
+
+    @property
+    def blend(self) -> BlendingStage:
+        """See `Backend.blend`."""
+        from .blending import blend
+
+        return blend
 
     @property
     def loss_and_gradient(self) -> LossStage:
