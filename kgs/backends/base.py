@@ -114,10 +114,14 @@ class BlendingStage(Protocol):
         """
 
 
-class LossStage(Protocol):
-    """The stage of :func:`kgs.losses.photometric_loss`."""
+class LossStage(ABC):
+    """The stage of :func:`kgs.losses.photometric_loss`, forward and backward.
 
-    def __call__(
+    `kgs.losses.photometric` has all of it in torch, and wraps it in an autograd function.
+    """
+
+    @abstractmethod
+    def forward(
         self,
         image: Tensor,
         target: Tensor,
@@ -125,13 +129,17 @@ class LossStage(Protocol):
         variance: Tensor,
         taps: list[float],
         dssim_weight: float,
-        gradient: bool,
-    ) -> tuple[Tensor, Tensor | None]:
-        """L1 + `dssim_weight` (1 - SSIM), 0-d, and its gradient with respect to the image, or None if not wanted.
+        keep: bool,
+    ) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """L1 + `dssim_weight` (1 - SSIM), 0-d, and with `keep` what `backward` needs.
 
         Images are `(B, C, H, W)`, H and W at least the window; `mean` and `variance` `(1, B C, H, W)` those of the
-        target under the window with these taps. See `kgs.losses.photometric`, which has all of it in torch.
+        target under the window with these taps.
         """
+
+    @abstractmethod
+    def backward(self, kept: tuple[Tensor, ...], taps: list[float], dssim_weight: float, grad: Tensor) -> Tensor:
+        """From the gradient of the loss, 0-d, to that of the image; `kept` stays as it is."""
 
 
 class MomentsStage(Protocol):
@@ -152,7 +160,7 @@ class Backend(ABC):
         dtypes: of the tensors it works on.
         tile_size: side of its tiles in pixels, where `RasterOptions.tile_size` is None.
         package: what must be installed beside torch, and how to install it; None for nothing.
-        has_loss: whether it has `loss_and_gradient`.
+        has_loss: whether it has `loss`.
         has_moments: whether it has `local_moments`.
     """
 
@@ -207,7 +215,7 @@ class Backend(ABC):
         """Its blending with a background."""
 
     @property
-    def loss_and_gradient(self) -> LossStage:
+    def loss(self) -> LossStage:
         """Its photometric loss, where it has one."""
         raise NotImplementedError(f"{self.name} has no photometric loss")
 

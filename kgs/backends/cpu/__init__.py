@@ -81,11 +81,11 @@ class CpuBackend(Backend):
         return blend
 
     @property
-    def loss_and_gradient(self) -> LossStage:
-        """See `Backend.loss_and_gradient`."""
-        from .loss import loss_and_gradient
+    def loss(self) -> LossStage:
+        """See `Backend.loss`."""
+        from .loss import CpuLoss
 
-        return loss_and_gradient
+        return CpuLoss()
 
     @property
     def local_moments(self) -> MomentsStage:

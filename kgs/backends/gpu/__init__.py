@@ -95,11 +95,11 @@ class GpuBackend(Backend):
         return blend
 
     @property
-    def loss_and_gradient(self) -> LossStage:
-        """See `Backend.loss_and_gradient`."""
-        from .loss import loss_and_gradient
+    def loss(self) -> LossStage:
+        """See `Backend.loss`."""
+        from .loss import GpuLoss
 
-        return loss_and_gradient
+        return GpuLoss()
 
 
 def _is_interpreted() -> bool:
