@@ -11,14 +11,14 @@ from torch.utils._python_dispatch import _disable_current_modes
 import kgs
 from kgs import backends
 from kgs.backends import gpu
-from kgs.backends.gpu import compositing, loss, projection
+from kgs.backends.gpu import compositing, loss, optimizer, projection
 from kgs.datasets import synthetic_scene
 from kgs.fit import FitConfig, Trainer
 from kgs.fit.plan import make_plan
 from kgs.init_points import InitialPoints
 
 CPU = torch.device("cpu")
-MAX_LAUNCHES, MAX_WAITS = 75, 1  # of a training step on a GPU
+MAX_LAUNCHES, MAX_WAITS = 55, 1  # of a training step on a GPU
 # operators that compute nothing, and those that wait for a number
 _FREE = (
     "alias as_strided detach empty empty_like empty_strided expand lift_fresh new_empty permute reshape resize_ select"
@@ -57,7 +57,7 @@ def test_a_step_is_few_launches_and_waits(scene, few, monkeypatch):
             launched(kernel, *arguments, **options)
 
     launched = compositing.launch
-    for stage in (compositing, loss, projection):
+    for stage in (compositing, loss, optimizer, projection):
         monkeypatch.setattr(stage, "launch", launch)
     monkeypatch.setattr(torch.Tensor, "tolist", lambda x: waits.append(1) or real(x))
     with Operators() as operators:
