@@ -18,7 +18,7 @@ def listed(names: Sequence[object], max_names: int = 3) -> str:
     return f"{text} and {more} more" if more > 0 else text
 
 
-def counted(number: int, noun: str) -> str:
+def quantity(number: int, noun: str) -> str:
     """A number and a noun, whose plural has an s: as "1 photo" and "2 photos"."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 

@@ -4,7 +4,7 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kgs._support.errors import ArgumentError, DataError, counted, printable
+from kgs._support.errors import ArgumentError, DataError, printable, quantity
 from kgs.app.console import VIEWER, as_line, each, say, say_next
 from kgs.fit.config import Backend, Background
 
@@ -103,7 +103,7 @@ def clean(
         fitted = len(whole)
     with replacing(out.parent, "clean") as new:
         save_ply(new / out.name, model, offset=offset)
-    kinds = ", ".join(counted(count, kind.removesuffix("s")) for kind, count in removed.items())
+    kinds = ", ".join(quantity(count, kind.removesuffix("s")) for kind, count in removed.items())
     say(f"{printable(out)}: {len(model)} of {fitted} Gaussians; removed: {kinds}")
     if fit is None:
         say("no photo was compared, and floaters are the isolated ones alone: --cameras SCENE names the photos")

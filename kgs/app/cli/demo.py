@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from kgs._support.errors import counted, printable
+from kgs._support.errors import printable, quantity
 from kgs.app.console import VIEWER, as_line, each, open_in_browser, say, say_next
 from kgs.datasets.folders import LAYOUT_FILES
 from kgs.fit.config import DEMO, DEMO_STEPS, ROOM_DEMO, Backend, FitConfig
@@ -88,7 +88,7 @@ def demo(
     say(f"device: {device_name(found)}")
     request, loaded = _write_scene(scene, out, size, seed, resume)
     height, width = loaded.train.images.shape[-2:]
-    say(f"{counted(len(loaded.train), 'training photo')} of {width}x{height}, {len(loaded.test)} held out")
+    say(f"{quantity(len(loaded.train), 'training photo')} of {width}x{height}, {len(loaded.test)} held out")
     published = fit_folder(loaded, config, out, request, resume=resume)
     splat = published.folder / "splat.ply"
     if published.signal:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 import tyro
 
-from kgs._support.errors import ArgumentError, DataError, counted, printable
+from kgs._support.errors import ArgumentError, DataError, printable, quantity
 from kgs.app.console import VIEWER, as_line, is_terminal, open_in_browser, say, say_next
 from kgs.fit.config import COARSE, DETAILS, PRESETS, Background, FitConfig, min_side
 
@@ -200,7 +200,7 @@ def fit(
         if downscale is None:  # a size that is too small is refused before
             raise DataError(scene, "images", reason)
         raise ArgumentError(f"downscale: {reason}")
-    kept = f"{counted(len(loaded.train), 'training photo')} of {width}x{height}"
+    kept = f"{quantity(len(loaded.train), 'training photo')} of {width}x{height}"
     say(f"{printable(scene)}: {kept}, {len(loaded.test) or 'none'} held out")
     with on_ctrl_c("the cameras that were found are kept" if unposed else ""):
         published = fit_folder(loaded, config, out, request, resume=resume, lpips=lpips, live=live, stages=stages)

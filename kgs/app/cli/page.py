@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kgs._support.errors import ArgumentError, counted, printable
+from kgs._support.errors import ArgumentError, printable, quantity
 from kgs.app.console import as_line, open_in_browser, say, say_next
 from kgs.fit.config import Backend, Background
 
@@ -93,7 +93,7 @@ def page(
         )
     level = fit.metrics["views"]["psnr"]
     measured = f", PSNR {level:.4g}" if level is not None else ""
-    photographs = f"{counted(len(scene.train), 'photo')} of {width}x{height}"
+    photographs = f"{quantity(len(scene.train), 'photo')} of {width}x{height}"
     say(f"{printable(out)}: {len(fit.model)} Gaussians, {photographs}{measured}")
     if cost:
         say(f"the page shows {cost}; {printable(ply)} has everything")

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import PurePosixPath, PureWindowsPath
 from typing import Any
 
-from kgs._support.errors import counted
+from kgs._support.errors import quantity
 from kgs.app.files.plot import PARTS, Runs, with_run
 
 # Titles and digits of the measures, by their keys in metrics.json.
@@ -66,7 +66,7 @@ def verdict(runs: Runs) -> str:
         return ""
     measured = {run: metrics[part] for run, metrics in runs.items() if metrics.get(part)}
     levels = {run: values["psnr"] for run, values in measured.items() if values.get("psnr") is not None}
-    photos = counted(len(next(iter(measured.values()))["views"]), "photo")
+    photos = quantity(len(next(iter(measured.values()))["views"]), "photo")
     which = {
         "test": f"{photos} held out of the training",
         "train": f"the {photos} it was trained on",
