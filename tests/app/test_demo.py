@@ -170,7 +170,7 @@ def test_the_room_is_a_scene_without_photos_of_others(tmp_path, capsys):
     for resume in ((), ("--resume",)):
         assert run("demo", "-o", tmp_path, "--scene", "room", "--steps", 2, *TINY, *resume) == 0
         said = capsys.readouterr().out
-        assert "3 training and 3 test views of 40x30" in said
+        assert "3 training photos of 40x30, 3 held out" in said
         assert ("resumed at step 2" in said) == bool(resume)
         assert "dataset_banana" not in said + Path(tmp_path, "index.html").read_text(encoding="utf-8")
 
