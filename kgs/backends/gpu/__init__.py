@@ -1,10 +1,10 @@
 """The backend of Triton kernels, for float32 on GPUs.
 
-`activation`, `projection`, `compositing`, `blending` and `loss` bring the kernels of a stage to torch, which stand in
-the file of kernels beside it; the other files of kernels are parts of these. `launch` calls them, and `entry_counts`
-tells compositing what projection has counted. Torch defines what is right; a kernel gives the same within the rounding
-of float32, and its formulas are explained in the torch code that it follows. `import kgs` does not import triton: a
-stage is imported when it is first used.
+`activation`, `projection`, `compositing`, `blending`, `loss` and `optimizer` bring the kernels of a stage to torch,
+which stand in the file of kernels beside it; the other files of kernels are parts of these. `launch` calls them, and
+`entry_counts` tells compositing what projection has counted. Torch defines what is right; a kernel gives the same
+within the rounding of float32, and its formulas are explained in the torch code that it follows. `import kgs` does not
+import triton: a stage is imported when it is first used.
 
 With TRITON_INTERPRET=1 in the environment the kernels run on a CPU, slowly: so they are tested without a GPU.
 
@@ -33,12 +33,13 @@ from kgs.backends.base import (
     CompositingCall,
     Compositor,
     LossStage,
+    OptimizerStages,
     ProjectionStage,
 )
 
 
 class GpuBackend(Backend):
-    """Kernels for pinhole cameras, tiles of 8 x 8 pixels and the loss; other cameras go to torch, inside the call."""
+    """Kernels for pinhole cameras, tiles of 8 x 8 pixels, loss and optimizer; other cameras go to torch, inside."""
 
     name = "triton"
     devices = ("cuda", "xpu")  # "cuda" are AMD's, too
@@ -46,6 +47,7 @@ class GpuBackend(Backend):
     tile_size = 8  # a constant of the kernels
     package = ("triton", "torch brings it on Linux; on Windows: pip install triton-windows")
     has_loss = True
+    has_optimizer = True
 
     def runs_on(self, device: torch.device) -> bool:
         """On GPUs, and on CPUs in Triton's interpreter."""
@@ -100,6 +102,13 @@ class GpuBackend(Backend):
         from .loss import GpuLoss
 
         return GpuLoss()
+
+    @property
+    def optimizer(self) -> OptimizerStages:
+        """See `Backend.optimizer`."""
+        from .optimizer import GpuOptimizer
+
+        return GpuOptimizer()
 
 
 def _is_interpreted() -> bool:
