@@ -120,8 +120,10 @@ class GaussianRenderer(nn.Module):
         values = torch.cat(list(features.values()), 1) if len(features) > 1 else projected.colors
         median = "median_depth" in outputs
         result = composite(projected, values, options=self.options, median_depth=median, backend=self.backend)
-        ends = accumulate((x.shape[1] for x in features.values()), initial=0)
-        images = {name: result.features[:, i:j] for name, (i, j) in zip(features, pairwise(ends), strict=True)}
+        images = {"image": result.features}
+        if len(features) > 1:
+            ends = accumulate((x.shape[1] for x in features.values()), initial=0)
+            images = {name: result.features[:, i:j] for name, (i, j) in zip(features, pairwise(ends), strict=True)}
         if "depth" in outputs:
             alpha = 1.0 - result.transmittance
             covered = alpha >= 1e-6
