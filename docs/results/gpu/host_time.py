@@ -153,7 +153,7 @@ def measure(steps: int, numbers: dict[str, list[list[Any]]]) -> None:
             rows[len(index)] = torch.zeros_like(index)
         return add(tensor, dim, rows[len(index)], source)
 
-    setattr(torch.Tensor, "index_add_", add_anywhere)
+    torch.Tensor.index_add_ = add_anywhere
     made = {name: make() for name, make in STEPS.items()}
     triton.runtime.driver.set_active(Driver())
     if hasattr(launching, "_DIRECT"):
