@@ -158,6 +158,10 @@ class GaussianModel(nn.Module):
 
         Args:
             backend: "auto", or the name of one, see `kgs.backends`. By "triton" differentiable once.
+
+        Raises:
+            ValueError: the backend does not exist, or does not cover a model of this dtype or device.
+            ModuleNotFoundError: the backend is numba or triton, and it is not installed.
         """
         chosen = choose(backend, "activation", self.means.device, lambda candidate: candidate.covers(self.means))
         # at degree 0 sh_rest gets no gradient, and an optimiser skips it
