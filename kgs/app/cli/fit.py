@@ -19,7 +19,7 @@ from kgs.fit.config import COARSE, DETAILS, PRESETS, Background, FitConfig, min_
 from .checks import SMALLEST, check_photos, check_photos_of, check_roll, check_side
 from .options import QUIET, Flag, IfGiven, Open, Out
 from .tools import check_installed, load_tools
-from .unposed import find_scene, on_ctrl_c, open_scene
+from .unposed import check_frames, find_scene, is_posed_by_kgs, on_ctrl_c, open_scene
 from .words import options_in
 
 # The short help shows these entries of FitConfig, and all other options of the command but the rare ones.
@@ -115,12 +115,15 @@ def fit(
 
     source = open_scene(scene)
     unposed = source is None
+    as_photos = source is None or is_posed_by_kgs(source)
+    if as_photos and hold_out is None:
+        hold_out = 0
     check_roll(roll)
     _check_size(size, downscale, unposed)
     if views is not None and views < 1:
         raise ArgumentError(f"views: expected a whole number of at least 1, got {views}")
     check_options(downscale, hold_out)
-    _check_frames(frames, scene)
+    check_frames(frames, scene)
     if lpips_weights is not None:
         weight_files(lpips_weights)
     check_folder(out, scene, make=False)
@@ -172,11 +175,11 @@ def fit(
     is_free = size is None and downscale is None  # the size follows from --detail
     say(f"device: {device_name(device)}")
     stages = Stages(say if is_terminal() else lambda line: None, unposed)
-    if is_free and (detail != "normal" or (unposed and device.type == "cpu")):
+    if is_free and (detail != "normal" or (as_photos and device.type == "cpu")):
         size = DETAILS[detail].size
         if config.coarse is None:
             config = replace(config, coarse=COARSE)
-    if preset in ("paper", "plain") and size is None and downscale is None and not unposed:
+    if preset in ("paper", "plain") and size is None and downscale is None and not as_photos:
         size = "field"
     if source is None:
         stages.begin("cameras")
@@ -261,13 +264,3 @@ def _check_size(size: int | str | None, downscale: float | None, unposed: bool) 
         raise ArgumentError(f"size: expected pixels for photos without camera poses, got {size!r}")
     if isinstance(size, int):
         check_side(size)
-
-
-def _check_frames(frames: int | None, scene: Path) -> None:
-    """Raise a ValueError unless so many frames can be taken from a video."""
-    from kgs.app.sfm.find import MIN_PHOTOS, find_video
-
-    if frames is not None and frames < MIN_PHOTOS:
-        raise ArgumentError(f"frames: expected at least {MIN_PHOTOS}, got {frames}")
-    if frames is not None and find_video(scene) is None:
-        raise ArgumentError("frames: expected a video to take them from, got photos")
