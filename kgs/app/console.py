@@ -131,7 +131,7 @@ def progress(total: int, title: str, done: int = 0, unit: str = "step") -> Itera
         seconds = time.monotonic() - begin
         if units == 1:
             first = seconds
-        if seconds >= due and units > 1:
+        if seconds >= due and units > 1 and done < total:
             due = 2 * seconds
             left = (seconds - first) / (units - 1) * (total - done)
             parts = [f"{title}: {done} of {total} {unit}s"]

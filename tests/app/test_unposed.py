@@ -146,6 +146,26 @@ def test_half_of_the_steps_are_coarse_at_the_size_that_the_command_chooses(folde
     assert seen == [coarse for _, coarse in cases for _ in range(2)]
 
 
+def test_a_second_fit_measures_a_photo_that_it_leaves_out(folder, tmp_path, capsys):
+    photos = folder(5)
+    for out, options in (("plain", []), ("measured", ["--measure"]), ("without", ["--hold-out", 5])):
+        assert run("fit", photos, "-o", tmp_path / out, *FIT, *options) == 0
+    said = capsys.readouterr().out
+    plain, measured = ((tmp_path / out / "splat.ply").read_bytes() for out in ("plain", "measured"))
+    assert plain == measured  # of all photos
+    metrics = json.loads((tmp_path / "measured" / "metrics.json").read_text())
+    assert (metrics["test"], len(metrics["train"]["views"])) == (None, 5)
+    (row,) = metrics["held_out"]["views"]
+    assert f"a fit without {row['name']} shows it with PSNR {row['psnr']:.4g}" in said
+    assert said.count("no photo was held out") == 1
+    assert metrics["held_out"] == json.loads((tmp_path / "without" / "metrics.json").read_text())["test"]
+    page = (tmp_path / "measured" / "index.html").read_text(encoding="utf-8")
+    assert "1 photo held out of another fit with the same settings" in page
+    for options in (["--hold-out", 2], ["--views", 3]):
+        assert run("fit", photos, "-o", tmp_path / "out", "--measure", *options) == 2
+        assert "--measure: expected photos" in one_line(capsys)
+
+
 @pytest.mark.slow
 def test_all_photos_are_trained_on_unless_some_are_held_out(folder, tmp_path):
     nine = folder(9)

@@ -3,6 +3,7 @@
 import inspect
 import os
 import re
+import sys
 import warnings
 from contextlib import nullcontext
 from dataclasses import MISSING, field, make_dataclass, replace
@@ -24,7 +25,7 @@ from .words import options_in
 
 # The short help shows these entries of FitConfig, and all other options of the command but the rare ones.
 _OF_CONFIG = ("steps", "drop", "refine_poses", "seed", "device")
-_RARE = ("downscale", "background", "lpips_weights", "mask_mode", "frames", "title", "live", "config")
+_RARE = ("downscale", "background", "lpips_weights", "mask_mode", "roll", "frames", "title", "live", "config")
 
 
 def first_config(words: list[str]) -> FitConfig:
@@ -60,6 +61,7 @@ def fit(
     mask_mode: Literal["ignore", "transparent"] = "ignore",
     preset: Literal["auto", "paper", "plain"] = "auto",
     detail: Literal["low", "normal", "high"] = "normal",
+    measure: Flag = False,
     resume: Flag = False,
     title: IfGiven[str] = None,
     no_photos: Flag = False,
@@ -96,6 +98,8 @@ def fit(
             without dropping. See --preset paper --help-all.
         detail: sets size, steps and initial points together. low: 378 pixels. high: 1000 pixels. Options given by name
             win. See --detail high --help-all.
+        measure: measure how good other views are, on a photo that a second fit leaves out. For unposed photos; it takes
+            nearly twice as long.
         resume: continue the unfinished fit in the folder of the results, or the finished one.
         title: of the page. Unless given: the name of the folder.
         no_photos: leave the photos out of the page.
@@ -116,6 +120,9 @@ def fit(
     source = open_scene(scene)
     unposed = source is None
     as_photos = source is None or is_posed_by_kgs(source)
+    if measure and (not as_photos or hold_out or views is not None):
+        reason = "photos without camera poses, and neither --hold-out nor --views: these hold photos out themselves"
+        raise ArgumentError(f"measure: expected {reason}")
     if as_photos and hold_out is None:
         hold_out = 0
     check_roll(roll)
@@ -146,6 +153,7 @@ def fit(
 
     from kgs._support.machine import device_name
     from kgs.app.fit_folder import fit_folder
+    from kgs.app.held_out import MIN_PHOTOS, measure_held_out
     from kgs.app.scene_request import SceneRequest
     from kgs.app.stages import Stages
     from kgs.datasets import load_scene
@@ -174,7 +182,7 @@ def fit(
     )
     is_free = size is None and downscale is None  # the size follows from --detail
     say(f"device: {device_name(device)}")
-    stages = Stages(say if is_terminal() else lambda line: None, unposed)
+    stages = Stages(say if is_terminal() else lambda line: None, unposed, measure)
     if is_free and (detail != "normal" or (as_photos and device.type == "cpu")):
         size = DETAILS[detail].size
         if config.coarse is None:
@@ -206,7 +214,18 @@ def fit(
     kept = f"{quantity(len(loaded.train), 'training photo')} of {width}x{height}"
     say(f"{printable(scene)}: {kept}, {len(loaded.test) or 'none'} held out")
     with on_ctrl_c("the cameras that were found are kept" if unposed else ""):
-        published = fit_folder(loaded, config, out, request, resume=resume, lpips=lpips, live=live, stages=stages)
+        held_out: dict[str, Any] = {}
+        if measure and len(loaded.train) < MIN_PHOTOS:
+            say(f"other views are not measured: --measure needs at least {MIN_PHOTOS} photos")
+        elif measure:
+            stages.begin("measurement")
+            held_out, stopped_by = measure_held_out(request, source, len(loaded.train), config, lpips, say)
+            if stopped_by:
+                say("stopped in the measurement: the fit was not begun", sys.stderr)
+                return 128 + stopped_by
+        published = fit_folder(
+            loaded, config, out, request, resume=resume, lpips=lpips, held_out=held_out, live=live, stages=stages
+        )
     metrics = published.fit.metrics
     say(as_text(metrics))
     posed = out if unposed else scene
