@@ -231,7 +231,7 @@ def fit(
     posed = out if unposed else scene
     splat = published.folder / "splat.ply"
     renders = out / "renders"
-    say(f"{printable(splat)}: {metrics['gaussians']} Gaussians after {metrics['steps']} steps")
+    say(f"{printable(splat)}: {quantity(metrics['gaussians'], 'Gaussian')} after {quantity(metrics['steps'], 'step')}")
     if needless := left_out(published.fit.decisions):
         say(needless)
     if published.signal:
