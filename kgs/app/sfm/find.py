@@ -93,9 +93,8 @@ def notes_on(folder: Path, masks: Path | None = None) -> list[str]:
     if called := [path for path in list_photos(folder) if is_like_mask(path)]:
         notes.append(f"named like masks and taken for photos: {listed_files(called)}: {MASKS_ARE_IN}")
     if converted := sorted(_converted(folder)):
-        notes.append(
-            f"not used, but the JPEG beside it: {quantity(len(converted), 'raw or HEIC file')}: {listed_files(converted)}"
-        )
+        files = quantity(len(converted), "raw or HEIC file")
+        notes.append(f"{files} not used, the JPEG of the same name is: {listed_files(converted)}")
     return notes
 
 
