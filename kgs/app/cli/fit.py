@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, get_type_hints
 import tyro
 
 from kgs._support.errors import ArgumentError, DataError, printable, quantity
-from kgs.app.console import VIEWER, as_line, is_terminal, open_in_browser, say, say_next
+from kgs.app.console import VIEWER, as_line, open_in_browser, say, say_next, say_on_terminal
 from kgs.fit.config import COARSE, DETAILS, PRESETS, Background, FitConfig, min_side
 
 from .checks import SMALLEST, check_photos, check_photos_of, check_roll, check_side
@@ -182,7 +182,7 @@ def fit(
     )
     is_free = size is None and downscale is None  # the size follows from --detail
     say(f"device: {device_name(device)}")
-    stages = Stages(say if is_terminal() else lambda line: None, unposed, measure)
+    stages = Stages(say_on_terminal, unposed, measure)
     if is_free and (detail != "normal" or (as_photos and device.type == "cpu")):
         size = DETAILS[detail].size
         if config.coarse is None:
