@@ -98,8 +98,7 @@ def fit(
             without dropping. See --preset paper --help-all.
         detail: sets size, steps and initial points together. low: 378 pixels. high: 1000 pixels. Options given by name
             win. See --detail high --help-all.
-        measure: measure how good other views are, on a photo that a second fit leaves out. For unposed photos; it takes
-            nearly twice as long.
+        measure: measure a photo that a second fit leaves out. Only of unposed photos; it takes nearly twice as long.
         resume: continue the unfinished fit in the folder of the results, or the finished one.
         title: of the page. Unless given: the name of the folder.
         no_photos: leave the photos out of the page.
