@@ -99,7 +99,7 @@ def fit(
         detail: sets size, steps and initial points together. low: 378 pixels. high: 1000 pixels. Options given by name
             win. See --detail high --help-all.
         measure: measure a photo that a second fit leaves out. Only of unposed photos; it takes nearly twice as long.
-        resume: continue the unfinished fit in the folder of the results, or the finished one.
+        resume: continue the fit in OUT, unfinished or finished.
         title: of the page. Unless given: the name of the folder.
         no_photos: leave the photos out of the page.
         roll: turn page and film clockwise by so many degrees.
