@@ -52,6 +52,12 @@ def say_next(first: str, *others: str) -> None:
     say("\n  ".join(["next:", first, *others]) if others and is_terminal() else f"next: {first}")
 
 
+def say_on_terminal(line: str) -> None:
+    """As :func:`say`, but only to somebody who waits for what comes next."""
+    if is_terminal():
+        say(line)
+
+
 def is_terminal() -> bool:
     """Whether somebody reads stdout as it is written."""
     with suppress(OSError, ValueError, AttributeError):  # closed, or None
@@ -131,7 +137,7 @@ def progress(total: int, title: str, done: int = 0, unit: str = "step") -> Itera
         seconds = time.monotonic() - begin
         if units == 1:
             first = seconds
-        if seconds >= due and units > 1:
+        if seconds >= due and units > 1 and done < total:
             due = 2 * seconds
             left = (seconds - first) / (units - 1) * (total - done)
             parts = [f"{title}: {done} of {total} {unit}s"]

@@ -30,6 +30,7 @@ from .words import options_in, take_quiet
 COMMANDS = {
     "demo": "kgs.app.cli.demo:demo",
     "fit": "kgs.app.cli.fit:fit",
+    "poses": "kgs.app.cli.poses:poses",
     "render": "kgs.app.cli.render:render",
     "eval": "kgs.app.cli.evaluate:evaluate",
     "page": "kgs.app.cli.page:page",
