@@ -8,11 +8,13 @@ from torch import Tensor
 from kgs.camera import image_size, pinhole_cameras
 from kgs.types import Gaussians, RasterOptions
 
-from .base import Backend, CompositingCall, CompositingInputs
+from .base import AdamUpdate, Backend, CompositingCall, CompositingInputs
 from .torch import TorchBackend
 
 BOUND = 5e-5  # a larger disagreement is no rounding
 _WINDOW, _SIGMA, _WEIGHT = 11, 1.5, 0.2  # of the loss
+_RATE, _STEP, _BETAS, _EPS = 0.01, 3.0, (0.9, 0.999), 1e-8  # of Adam
+_SCALE, _FACTOR = (25.0, 15.0), 0.9  # of gradients, of opacities
 # thresholds: a layer that counts for one backend alone must not matter
 _OPTIONS = RasterOptions(tile_size=8, alpha_threshold=1e-6, transmittance_stop=1e-5)
 
@@ -23,7 +25,8 @@ def disagreement(backend: Backend, device: torch.device) -> float:
     """The largest difference from torch in float64, over the largest value of its kind.
 
     Of a training step of 32 Gaussians before two cameras: harmonics of degree 3, a stack of opaque Gaussians, five
-    features, the loss; the gradients of all Gaussians, of poses and intrinsics, and of the image.
+    features, the loss; the gradients of all Gaussians, of poses and intrinsics, and of the image. And of what an
+    optimizer does with gradients.
 
     Args:
         backend: works in float32 on the device.
@@ -33,6 +36,8 @@ def disagreement(backend: Backend, device: torch.device) -> float:
     pairs = list(zip(_render(backend, device), _render(TorchBackend(), reference_device), strict=True))
     if backend.has_loss:
         pairs += zip(_loss(backend, device), _exact_loss(), strict=True)
+    if backend.has_optimizer:
+        pairs += zip(_optimized(backend, device), _exactly_optimized(), strict=True)
     return max(_relative(value, expected) for value, expected in pairs)
 
 
@@ -96,6 +101,37 @@ def _exact_loss() -> tuple[Tensor, Tensor]:
     image = image.requires_grad_()
     loss = (image - target).abs().mean() + 2 * _WEIGHT * ssim_loss(image, target, _WINDOW)
     return loss, torch.autograd.grad(loss, image)[0]
+
+
+def _before() -> tuple[Tensor, ...]:
+    """Parameters, gradients, both moments, sums of norms, logits."""
+    return _random(40), _random(40, seed=1), _random(40, seed=2), _random(40, low=0.0, seed=3), _random(20), _random(20)
+
+
+def _optimized(backend: Backend, device: torch.device) -> list[Tensor]:
+    """What the stages of an optimizer change: parameters and moments, sums and counts, logits."""
+    *update, sums, logits = (x.to(device, torch.float32) for x in _before())
+    parameter, gradient, exp_avg, exp_avg_sq = update
+    counts = torch.zeros(20, dtype=torch.int64, device=device)
+    ids = torch.arange(19, -1, -1, device=device)
+    stages = backend.optimizer
+    stages.adam([AdamUpdate(parameter, gradient, exp_avg, exp_avg_sq, _RATE, _STEP)], _BETAS, _EPS)
+    stages.add_gradient_norms(sums, counts, ids, gradient.view(20, 2), _SCALE)
+    stages.decay_opacity(logits, _FACTOR)
+    return [parameter, exp_avg, exp_avg_sq, sums, counts, logits]
+
+
+def _exactly_optimized() -> list[Tensor]:
+    """The same by the formulas."""
+    parameter, gradient, exp_avg, exp_avg_sq, sums, logits = _before()
+    (beta1, beta2), (x, y) = _BETAS, torch.tensor(_SCALE, device="cpu")
+    exp_avg = beta1 * exp_avg + (1 - beta1) * gradient
+    exp_avg_sq = beta2 * exp_avg_sq + (1 - beta2) * gradient.square()
+    root = (exp_avg_sq / (1 - beta2**_STEP)).sqrt() + _EPS
+    parameter = parameter - _RATE * exp_avg / (1 - beta1**_STEP) / root
+    norms = torch.hypot(gradient[::2] * x, gradient[1::2] * y).flip(0)
+    decayed = (_FACTOR * logits.sigmoid()).logit()
+    return [parameter, exp_avg, exp_avg_sq, sums + norms, torch.ones_like(sums), decayed]
 
 
 def _relative(value: Tensor, expected: Tensor) -> float:

@@ -348,10 +348,13 @@ class Trainer:
         rate = decayed(recipe.lr_means, recipe.lr_means_final, progress)
         state.optimizer.param_groups[0]["lr"] = state.start.extent * rate
         degree = sum(state.step >= step for step in self.plan.schedule.sh)
-        state.model.sh_degree = max(state.model.sh_degree, degree)  # a finished fit that goes on keeps its degree
+        if degree > state.model.sh_degree:  # a finished fit that goes on keeps its degree
+            state.model.sh_degree = degree
         if state.drop is not None:
             state.drop.progress = progress
-            state.drop.train(state.step <= self.plan.schedule.drop)
+            drops = state.step <= self.plan.schedule.drop
+            if drops != state.drop.training:
+                state.drop.train(drops)
 
     def _move(self, progress: float) -> None:
         """Change the parameters by their gradients."""

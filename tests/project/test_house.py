@@ -28,7 +28,7 @@ MAY_IMPORT = {  # a room, and the others that it may import
     "metrics": GROUND | {"datasets"},
     "init_points": GROUND | {"datasets"},
     "fit": GROUND | {"losses", "datasets", "metrics", "init_points"},
-    "bench": GROUND | {"losses"},
+    "bench": GROUND | {"losses", "fit"},
     "app": LIBRARY,  # which prints, locks and publishes: no other room but the study knows it
     "study": LIBRARY | {"app"},  # which no other room knows
 }

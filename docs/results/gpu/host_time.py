@@ -4,7 +4,8 @@ BEFORE and AFTER are Python programs of two installations of kgs, which are meas
 that says that there is a card of compute capability 9.0 and that launches nothing; all else is real: kernels are
 compiled, arguments specialized, torch's operators called, on so small a scene that their own work hardly counts.
 Numbers that are read are those that the same step reads in Triton's interpreter. Prints the medians of the processor
-time of a step, in microseconds, and those with `launch` itself left out.
+time of a step, in microseconds, and those with `launch` itself left out: of a step of `kgs bench speed`, and of one of
+a Trainer, which also drops Gaussians, observes gradients and fades opacities.
 """
 
 import argparse
@@ -16,12 +17,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
 
 GAUSSIANS, SIZE = 100, (24, 32)
-STAGES = ("compositing", "projection", "loss", "optimizer")
 READS = ("tolist", "__int__")
 
 
@@ -37,27 +38,53 @@ def reads(replace: Callable[[Any, Callable[[], Any]], Any]) -> None:
         setattr(torch.Tensor, name, read)
 
 
-def cases() -> Any:
-    """What has the training step."""
+def bench_step() -> Callable[[], Any]:
+    """The training step of `kgs bench speed`."""
     from kgs.bench.speed import Cases
 
     found = Cases(GAUSSIANS, SIZE, torch.device("cpu"), "torch")
     found.renderer.backend = "triton"
-    return found
+    return found.train
+
+
+def fit_step() -> Callable[[], Any]:
+    """That of a Trainer, of harmonics of degree 3; nothing is due after it."""
+    from kgs.datasets import synthetic_scene
+    from kgs.fit import FitConfig, Trainer
+    from kgs.fit.plan import make_plan
+    from kgs.init_points import InitialPoints
+
+    scene = synthetic_scene(train_views=2, test_views=1, size=SIZE, seed=1)
+    plan = make_plan(scene, FitConfig(steps=30_000, sh_degree=3, backend="triton"))
+    schedule = plan.schedule._replace(sh=(0, 0, 0), densify=(), reset=(), haze=(), evaluate=())
+    points = torch.rand(GAUSSIANS, 3, generator=torch.Generator().manual_seed(0))
+    fit = Trainer(scene, replace(plan, schedule=schedule), InitialPoints(points, points, "random"))
+    fit._look_every = 10**9  # as in 19 of 20 steps on a GPU
+    fit._loss = 0.0
+    return fit.train_step
+
+
+STEPS = {"bench": bench_step, "fit": fit_step}
+WARM = 2  # steps before; the first with each view reads its camera
 
 
 def record() -> None:
-    """In the interpreter: print what a step reads."""
-    step = cases().train
-    step()
-    found: list[Any] = []
+    """In the interpreter: print what each of the first steps of each kind reads."""
+    found: dict[str, list[list[Any]]] = {}
+    current: list[Any] = []
 
     def note(_: Any, real: Callable[[], Any]) -> Any:
-        found.append(real())
-        return found[-1]
+        current.append(real())
+        return current[-1]
 
     reads(note)
-    step()
+    for name, make in STEPS.items():
+        step = make()
+        found[name] = []
+        for _ in range(WARM + 1):
+            current.clear()
+            step()
+            found[name].append(list(current))
     print(json.dumps(found))
 
 
@@ -109,47 +136,55 @@ class Driver:
         """Nothing was loaded."""
 
 
-def measure(steps: int, numbers: list[Any]) -> None:
-    """Print the medians of a step that reads some numbers, and of one without `launch`, as JSON."""
-    from importlib import import_module
-
+def measure(steps: int, numbers: dict[str, list[list[Any]]]) -> None:
+    """Print medians of steps of each kind, which read these numbers, and of steps without `launch`, as JSON."""
     import triton
 
     from kgs import stages
     from kgs.backends import gpu
+    from kgs.backends.gpu import launch as launching
 
     gpu.GpuBackend.runs_on = lambda self, device: True
     stages._check_projected = lambda projected, features: None  # it looks at the numbers of a CPU's tensors
-    step = cases().train
+    add, rows = torch.Tensor.index_add_, dict[int, torch.Tensor]()
+
+    def add_anywhere(tensor: Any, dim: int, index: Any, source: Any) -> Any:  # no kernel has written the rows
+        if len(index) not in rows:
+            rows[len(index)] = torch.zeros_like(index)
+        return add(tensor, dim, rows[len(index)], source)
+
+    torch.Tensor.index_add_ = add_anywhere
+    made = {name: make() for name, make in STEPS.items()}
     triton.runtime.driver.set_active(Driver())
-    launching = import_module("kgs.backends.gpu.launch")
     if hasattr(launching, "_DIRECT"):
         launching._DIRECT = ("cpu",)
-    position = 0
+    to_read: list[Any] = []
 
     def replay(tensor: Any, real: Callable[[], Any]) -> Any:
-        nonlocal position
         real()
-        position += 1
-        return numbers[position - 1]
+        return to_read.pop()
 
-    def timed(count: int) -> float:
-        nonlocal position
-        found = []
-        for _ in range(count):
-            position = 0
-            start = time.process_time_ns()
-            step()
-            found.append((time.process_time_ns() - start) / 1e3)
-            assert position == len(numbers)
-        return statistics.median(found)
+    def run(name: str, read: list[Any]) -> float:
+        to_read[:] = reversed(read)
+        start = time.process_time_ns()
+        made[name]()
+        microseconds = (time.process_time_ns() - start) / 1e3
+        assert not to_read
+        return microseconds
+
+    def timed(name: str, count: int) -> float:
+        return statistics.median(run(name, numbers[name][-1]) for _ in range(count))
 
     reads(replay)
-    timed(20)  # compiles
-    whole = timed(steps)
-    for name in STAGES:
-        import_module(f"kgs.backends.gpu.{name}").launch = lambda *arguments, **options: None
-    print(json.dumps([whole, timed(steps)]))
+    for name in STEPS:
+        for read in numbers[name]:  # compiles
+            run(name, read)
+        timed(name, 20)
+    found = {name: timed(name, steps) for name in STEPS}
+    for module in [module for name, module in sys.modules.items() if name.startswith("kgs.backends.gpu.")]:
+        if module is not launching and hasattr(module, "launch"):
+            module.launch = lambda *arguments, **options: None
+    print(json.dumps(found | {f"{name} without launch": timed(name, steps) for name in STEPS}))
 
 
 def output_of(command: list[str], environment: dict[str, str], given: str = "") -> Any:
@@ -175,14 +210,15 @@ def main() -> None:
         return measure(arguments.steps, json.loads(sys.stdin.read()))
     interpreted = os.environ | {"TRITON_INTERPRET": "1"}
     numbers = [json.dumps(output_of([program, __file__, "--record"], interpreted)) for program in arguments.programs]
-    found: list[list[list[float]]] = [[] for _ in arguments.programs]
+    found: list[list[dict[str, float]]] = [[] for _ in arguments.programs]
     for _ in range(arguments.n):
         for program, read, medians in zip(arguments.programs, numbers, found, strict=True):
             command = [program, __file__, "--measure", "--steps", str(arguments.steps)]
             medians.append(output_of(command, dict(os.environ), read))
     for program, medians in zip(arguments.programs, found, strict=True):
         print(program)
-        for name, values in zip(("step", "without launch"), zip(*medians, strict=True), strict=True):
+        for name in medians[0]:
+            values = [each[name] for each in medians]
             each = ", ".join(f"{x:.0f}" for x in values)
             print(f"  {name}: {statistics.median(values):.0f} us ({each})")
 

@@ -17,8 +17,9 @@ _DIRECT = ("cuda",)  # types of devices; what Triton compiles for on Intel's is 
 _HOOKS = ("launch_enter_hook", "launch_exit_hook", "add_stages_inspection_hook")
 _MAX_SMALL = 2**31 - 1  # bytes; kernels for AMD's GPUs address tensors of more than that otherwise
 _IS_AMD = torch.version.hip is not None
+_NOTHING = nullcontext[None]()
 
-_compiled: dict[Any, Any] = {}  # by the key of `specialization`
+_compiled: dict[Any, tuple[Any, ...]] = {}  # by the key of `specialization`: what is called, and what has to stay
 _arguments: dict[int, tuple[Any, tuple[bool, ...]]] = {}  # by its id a kernel, which thereby stays, and see below
 
 
@@ -32,7 +33,7 @@ def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, warps: int = 4, 
         warps: of each program.
         constants: arguments that the kernel is compiled for, in their order, behind all others.
     """
-    if not all(grid):
+    if 0 in grid:
         return
     device = _device_of(arguments)
     if device.type not in _DIRECT or _is_watched(kernel):
@@ -40,18 +41,18 @@ def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, warps: int = 4, 
             _launch_by_triton(kernel, grid, arguments, warps, constants)
         return
     key, values = specialization(kernel, arguments, (device.index, warps, *constants.items()))
-    compiled = _compiled.get(key)
+    known = _compiled.get(key)
     with _current(device):
-        if compiled is None:
+        if known is None:
             compiled = _launch_by_triton(kernel, grid, arguments, warps, constants)
             if key is not None and all(hasattr(compiled, x) for x in ("run", "function", "packed_metadata")):
-                _compiled[key] = compiled
+                _compiled[key] = (compiled.run, compiled.function, compiled.packed_metadata, compiled)
             return
         if hasattr(kernel, "device_caches"):  # since Triton 3.3
             values += constants.values()
-        size = (*grid, 1, 1)[:3]
+        run, function, metadata, _ = known
         nothing = (None, None, None)  # for hooks
-        compiled.run(*size, _stream(device), compiled.function, compiled.packed_metadata, *nothing, *values)
+        run(*(*grid, 1, 1)[:3], _stream(device), function, metadata, *nothing, *values)
 
 
 def specialization(kernel: Any, arguments: tuple[Any, ...], rest: tuple[Any, ...]) -> tuple[Any, list[Any]]:
@@ -72,30 +73,29 @@ def specialization(kernel: Any, arguments: tuple[Any, ...], rest: tuple[Any, ...
     key: list[Any] = [id(kernel), *rest]
     values: list[Any] = []
     for value, as_it_is in zip(arguments, _not_specialized(kernel), strict=False):
-        if isinstance(value, Tensor):
-            pointer = value.data_ptr()
-            key += (value.dtype, pointer % 16 == 0)
+        kind = type(value)
+        if kind is int:
+            key.append(_kind_of_integer(value, as_it_is))
+        elif kind is float or kind is bool:
+            key.append(kind)
+        elif isinstance(value, Tensor):
             if _IS_AMD:
                 key.append(value.untyped_storage().nbytes() <= _MAX_SMALL)
-            values.append(pointer)
-            continue
-        values.append(value)
-        if isinstance(value, float | bool):
-            key.append(type(value))
-        elif isinstance(value, int):
-            key.append(_bits(value))
-            if not as_it_is:
-                key.append("one" if value == 1 else "multiple" if value % 16 == 0 else "any")
+            dtype = value.dtype
+            value = value.data_ptr()
+            key.append((dtype,) if value % 16 else dtype)
         else:
             return None, values
+        values.append(value)
     return tuple(key), values
 
 
-def _bits(value: int) -> int:
-    """Of the type that Triton gives an integer; negative for one with a sign."""
-    if -(2**31) <= value < 2**31:
-        return -32
-    return 64 if value >= 2**63 else -64
+def _kind_of_integer(value: int, as_it_is: bool) -> int:
+    """The bits of the type that Triton gives it, negative with a sign; 2 more for 1, or 1 more for a multiple of 16."""
+    bits = -32 if -(2**31) <= value < 2**31 else 64 if value >= 2**63 else -64
+    if as_it_is:
+        return bits
+    return bits + (2 if value == 1 else 0 if value % 16 else 1)
 
 
 def _launch_by_triton(
@@ -108,9 +108,14 @@ def _launch_by_triton(
 
 def _is_watched(kernel: Any) -> bool:
     """Whether something wants to hear of each launch, as a profiler does: Triton tells it."""
+    if kernel.pre_run_hooks:
+        return True
     settings = _settings()
-    hooks = [getattr(settings, name, None) for name in _HOOKS]
-    return bool(kernel.pre_run_hooks) or any(hook is not None and getattr(hook, "calls", True) for hook in hooks)
+    for name in _HOOKS:
+        hook = getattr(settings, name, None)
+        if hook is not None and getattr(hook, "calls", True):
+            return True
+    return False
 
 
 @functools.cache
@@ -142,7 +147,10 @@ def blocks(count: int, size: int) -> int:
 
 def _device_of(arguments: tuple[Any, ...]) -> torch.device:
     """The device of the first tensor."""
-    return next(x.device for x in arguments if isinstance(x, Tensor))
+    for value in arguments:
+        if isinstance(value, Tensor):
+            return value.device
+    raise TypeError("launch: expected a tensor among the arguments, got none")
 
 
 def _stream(device: torch.device) -> int:
@@ -153,10 +161,17 @@ def _stream(device: torch.device) -> int:
 
 def _current(device: torch.device) -> AbstractContextManager[Any]:
     """Makes the device the current one, where there are several of its kind: Triton launches on that one."""
-    if device.type == "cpu" or device.index is None:
-        return nullcontext()
+    if device.type == "cpu" or device.index is None or _is_alone(device.type):
+        return _NOTHING
     module = torch.get_device_module(device)
     if device.index == module.current_device():
-        return nullcontext()
+        return _NOTHING
     context: AbstractContextManager[Any] = module.device(device.index)
     return context
+
+
+@functools.cache
+def _is_alone(kind: str) -> bool:
+    """Whether there is one device of a kind."""
+    count: int = torch.get_device_module(kind).device_count()
+    return count == 1

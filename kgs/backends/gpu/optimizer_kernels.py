@@ -67,8 +67,8 @@ def add_norms(sums, counts, ids, gradient, m, scale_x, scale_y, BLOCK: tl.conste
     x = tl.abs(tl.load(gradient + 2 * i, mask=inside, other=0.0) * scale_x)
     y = tl.abs(tl.load(gradient + 2 * i + 1, mask=inside, other=0.0) * scale_y)
     larger = tl.maximum(x, y)
-    ratio = tl.minimum(x, y) / larger
     usual = (larger > 0.0) & is_finite(x) & is_finite(y)
+    ratio = tl.minimum(x, y) / tl.where(usual, larger, 1.0)
     norm = tl.where(usual, larger * tl.sqrt(1.0 + ratio * ratio), x + y)  # no square overflows or vanishes
     row = tl.load(ids + i, mask=inside, other=0)
     tl.store(sums + row, tl.load(sums + row, mask=inside, other=0.0) + norm, mask=inside)
