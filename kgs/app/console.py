@@ -1,5 +1,6 @@
 """Lines and progress bars on the console. A closed pipe never aborts a fit."""
 
+import logging
 import os
 import shlex
 import sys
@@ -31,6 +32,26 @@ def say(line: str, file: TextIO | None = None) -> None:
 def say_next(*steps: str) -> None:
     """Suggest next commands to the user."""
     say("\n  ".join(["next:", *steps]))
+
+
+@contextmanager
+def log_shown() -> Iterator[None]:
+    """Print what the library's log says, a line each, on stderr."""
+    log = logging.getLogger("kgs")
+    level = log.level
+    handler = _Lines()
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(level)
+
+
+class _Lines(logging.Handler):
+    def emit(self, record: logging.LogRecord) -> None:
+        say(f"kgs: {record.getMessage()}", sys.stderr)
 
 
 def as_line(*words: object) -> str:

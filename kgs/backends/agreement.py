@@ -1,5 +1,7 @@
 """How far a backend is from torch on a small scene: whether "auto" trusts it, and what `kgs check` shows."""
 
+from dataclasses import dataclass, replace
+
 import torch
 from kornia.filters import gaussian_blur2d, get_gaussian_kernel1d
 from kornia.losses import ssim_loss
@@ -17,23 +19,55 @@ _WINDOW, _SIGMA, _WEIGHT = 11, 1.5, 0.2  # of the loss
 _OPTIONS = RasterOptions(tile_size=8, alpha_threshold=1e-6, transmittance_stop=1e-5)
 
 
+@dataclass(frozen=True)
+class Step:
+    """What a training step asks of a backend.
+
+    Args:
+        cameras: how many see the Gaussians.
+        bands: of the harmonics, `(degree + 1)^2`.
+        depths: whether depths and their squares are composited, too.
+        absgrad: whether absolute values of gradients are summed, too.
+        poses: whether poses and intrinsics have gradients.
+    """
+
+    cameras: int = 1
+    bands: int = 16
+    depths: bool = False
+    absgrad: bool = False
+    poses: bool = False
+
+
+EVERYTHING = Step(cameras=2, depths=True, poses=True)
+FITS = (Step(absgrad=True), Step(bands=1), Step(bands=1, poses=True))  # of fits, as they begin and as they end
+
+
 @torch.inference_mode(False)
 @torch.enable_grad()
-def disagreement(backend: Backend, device: torch.device) -> float:
+def disagreement(backend: Backend, device: torch.device, steps: tuple[Step, ...] = (EVERYTHING,)) -> float:
     """The largest difference from torch in float64, over the largest value of its kind.
 
-    Of a training step of 32 Gaussians before two cameras: harmonics of degree 3, a stack of opaque Gaussians, five
-    features, the loss; the gradients of all Gaussians, of poses and intrinsics, and of the image.
+    Of training steps of 32 Gaussians, among them an opaque stack: images, the loss, and all gradients that are asked
+    for.
 
     Args:
         backend: works in float32 on the device.
         device: where; torch is on the CPU where it has no float64 there.
+        steps: what is done.
     """
+    backend.compile_ahead(lambda of_cpu: _run(backend, of_cpu, steps), device)
     reference_device = device if device.type in ("cpu", "cuda") else torch.device("cpu")
-    pairs = list(zip(_render(backend, device), _render(TorchBackend(), reference_device), strict=True))
+    found = _run(backend, device, steps)
+    exact = [value for step in steps for value in _render(TorchBackend(), reference_device, step)]
     if backend.has_loss:
-        pairs += zip(_loss(backend, device), _exact_loss(), strict=True)
-    return max(_relative(value, expected) for value, expected in pairs)
+        exact += _exact_loss()
+    return max(_relative(value, expected) for value, expected in zip(found, exact, strict=True))
+
+
+def _run(backend: Backend, device: torch.device, steps: tuple[Step, ...]) -> list[Tensor]:
+    """What a backend finds."""
+    found = [value for step in steps for value in _render(backend, device, step)]
+    return found + list(_loss(backend, device) if backend.has_loss else ())
 
 
 def _random(*shape: int, low: float = -1.0, high: float = 1.0, seed: int = 0) -> Tensor:
@@ -43,8 +77,8 @@ def _random(*shape: int, low: float = -1.0, high: float = 1.0, seed: int = 0) ->
     return (unit * (high - low) + low).double()
 
 
-def _render(backend: Backend, device: torch.device) -> list[Tensor]:
-    """Image, depth and transmittance, and the gradients of all inputs; float64 from torch, else float32."""
+def _render(backend: Backend, device: torch.device, step: Step) -> list[Tensor]:
+    """Images, once with what gradients need and once without, and gradients; float64 from torch, else float32."""
     dtype = torch.float64 if isinstance(backend, TorchBackend) else torch.float32
     n = 32
     width, height = 16, 12
@@ -55,22 +89,28 @@ def _render(backend: Backend, device: torch.device) -> list[Tensor]:
     means[:8] = torch.tensor([0.3, -0.2, 2.5], device="cpu") * torch.linspace(1.0, 1.4, 8, device="cpu")[:, None]
     scales[:8] = 0.15
     opacities[:8] = 5.0
+    values = (means, _random(n, 4, seed=3), scales, opacities, _random(n, 16, 3, seed=4)[:, : step.bands])
     poses = torch.eye(4, device="cpu").repeat(2, 1, 1)
     poses[1, 0, 3] = 0.2
-    values = (means, _random(n, 4, seed=3), scales, opacities, _random(n, 16, 3, seed=4), poses)
     focal = torch.tensor([[15.0, 0.0, 7.5], [0.0, 15.0, 5.5], [0.0, 0.0, 1.0]], device="cpu").repeat(2, 1, 1)
-    leaves = [x.to(device, dtype).requires_grad_() for x in (*values, focal)]
-    camera = pinhole_cameras(leaves[5], leaves[6], width, height)
-    projected = backend.project(Gaussians(*leaves[:5]), camera, image_size(camera), _OPTIONS, True)
-    depths = projected.depths[:, None]
-    features = torch.cat([projected.colors, depths, depths.square()], 1)
+    leaves = [x.to(device, dtype).requires_grad_() for x in values]
+    lenses = [x[: step.cameras].to(device, dtype).requires_grad_(step.poses) for x in (poses, focal)]
+    camera = pinhole_cameras(*lenses, width, height)
+    options = replace(_OPTIONS, absgrad=step.absgrad)
+    projected = backend.project(Gaussians(*leaves), camera, image_size(camera), options, True)
+    features = projected.colors
+    if step.depths:
+        depths = projected.depths[:, None]
+        features = torch.cat([features, depths, depths.square()], 1)
     inputs = CompositingInputs(projected.means2d, projected.factors, projected.opacities, features)
     with torch.no_grad():
-        compositor = backend.compositor(CompositingCall(projected, features, _OPTIONS))
+        compositor = backend.compositor(CompositingCall(projected, features, options))
         (sums, transmittance, _), kept = compositor.forward(inputs, True)
         by_sums, by_transmittance = (_random(*x.shape, seed=5).to(device, dtype) for x in (sums, transmittance))
-        gradients, _ = compositor.backward(inputs, kept, by_sums, by_transmittance, (True,) * 4)
-    return [sums, transmittance, *torch.autograd.grad(inputs, leaves, gradients)]
+        gradients, absolute = compositor.backward(inputs, kept, by_sums, by_transmittance, (True,) * 4)
+        (drawn, behind, _), _ = compositor.forward(inputs, False)
+    images = [sums, transmittance, drawn, behind, *([] if absolute is None else [absolute])]
+    return images + list(torch.autograd.grad(inputs, leaves + lenses * step.poses, gradients))
 
 
 def _pictures() -> tuple[Tensor, Tensor]:
