@@ -94,8 +94,9 @@ def _render(backend: Backend, device: torch.device, step: Step) -> list[Tensor]:
     poses[1, 0, 3] = 0.2
     focal = torch.tensor([[15.0, 0.0, 7.5], [0.0, 15.0, 5.5], [0.0, 0.0, 1.0]], device="cpu").repeat(2, 1, 1)
     leaves = [x.to(device, dtype).requires_grad_() for x in values]
-    lenses = [x[: step.cameras].to(device, dtype).requires_grad_(step.poses) for x in (poses, focal)]
-    camera = pinhole_cameras(*lenses, width, height)
+    extrinsics, intrinsics = (x[: step.cameras].to(device, dtype).requires_grad_(step.poses) for x in (poses, focal))
+    camera = pinhole_cameras(extrinsics, intrinsics, width, height)
+    varying = [*leaves, extrinsics, intrinsics] if step.poses else leaves
     options = replace(_OPTIONS, absgrad=step.absgrad)
     projected = backend.project(Gaussians(*leaves), camera, image_size(camera), options, True)
     features = projected.colors
@@ -110,7 +111,7 @@ def _render(backend: Backend, device: torch.device, step: Step) -> list[Tensor]:
         gradients, absolute = compositor.backward(inputs, kept, by_sums, by_transmittance, (True,) * 4)
         (drawn, behind, _), _ = compositor.forward(inputs, False)
     images = [sums, transmittance, drawn, behind, *([] if absolute is None else [absolute])]
-    return images + list(torch.autograd.grad(inputs, leaves + lenses * step.poses, gradients))
+    return images + list(torch.autograd.grad(inputs, varying, gradients))
 
 
 def _pictures() -> tuple[Tensor, Tensor]:
