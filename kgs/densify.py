@@ -11,9 +11,11 @@ from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.graph import increment_version
 
 from kgs._support.errors import ArgumentError
 
+from .backends import optimizer_stages
 from .covariance import rotation_matrices
 from .model import GaussianModel
 from .types import ProjectedGaussians, check_kind
@@ -74,11 +76,15 @@ class Densifier:
         prune_opacity: Gaussians below this opacity are removed, in [0, 1].
         max_gaussians: upper bound for the count; Gaussians with the largest gradients come first. None: no limit.
         generator: draws the positions of split Gaussians; None makes a generator seeded with 0.
+        backend: "torch", "auto", "numba" or "triton": Triton has kernels for the statistics of renders of one camera,
+            and for `decay_opacity`.
 
     Raises:
         TypeError: `model` is not a GaussianModel.
         ValueError: a number is out of range, or the optimizer does not hold the model's parameters or holds state of
-            another shape (also raised by `step` and `reset_opacity`, which then change nothing).
+            another shape (also raised by `step` and `reset_opacity`, which then change nothing), or the backend does
+            not exist or does not cover the model.
+        ModuleNotFoundError: the backend is numba or triton, and it is not installed.
 
     Examples:
         >>> model = GaussianModel.from_points(torch.rand(20, 3), torch.rand(20, 3))
@@ -99,6 +105,7 @@ class Densifier:
         prune_opacity: float = 0.005,
         max_gaussians: int | None = None,
         generator: torch.Generator | None = None,
+        backend: str = "torch",
     ) -> None:
         check_kind("model", model, GaussianModel)
         maximum = 1 if max_gaussians is None else max_gaussians
@@ -124,6 +131,7 @@ class Densifier:
         self.prune_opacity = prune_opacity
         self.max_gaussians = max_gaussians
         self.generator = torch.Generator().manual_seed(0) if generator is None else generator
+        self._stages = optimizer_stages(backend, model.means)
         self._restart_statistics(torch.zeros_like(self.model.means[:, 0]))
         self._check()
 
@@ -156,7 +164,7 @@ class Densifier:
             >>> densifier.observe(out.projected)
             >>> optimizer.step()
         """
-        self._check()
+        self._check_count()
         count = projected.num_gaussians
         expected = len(self.model)
         if count != expected:
@@ -165,10 +173,15 @@ class Densifier:
             return
         gradient = self._gradient_of(projected.means2d)
         height, width = projected.image_size
-        norms = torch.hypot(gradient[:, 0] * (width / 2), gradient[:, 1] * (height / 2)) * projected.num_cameras
         ids = projected.gaussian_ids
-        self._statistics["gradient_sums"].index_add_(0, ids, norms)
-        self._statistics["counts"].index_add_(0, ids, torch.ones_like(ids))
+        sums = self._statistics["gradient_sums"]
+        counts = self._statistics["counts"]
+        if self._stages is not None and projected.num_cameras == 1:
+            self._stages.add_gradient_norms(sums, counts, ids, gradient, (width / 2, height / 2))
+            return
+        norms = torch.hypot(gradient[:, 0] * (width / 2), gradient[:, 1] * (height / 2)) * projected.num_cameras
+        sums.index_add_(0, ids, norms)
+        counts.index_add_(0, ids, torch.ones_like(ids))
 
     @torch.no_grad()
     def step(self) -> DensifyReport:
@@ -225,7 +238,12 @@ class Densifier:
         """
         if not 0.0 < factor < 1.0:
             raise ArgumentError(f"factor: expected a number in (0, 1), got {factor}")
-        logits = self.model.opacity_logits  # of f s(x): log f - log(e^-x + 1 - f)
+        logits = self.model.opacity_logits
+        if self._stages is not None and rows is None and logits.is_contiguous():
+            self._stages.decay_opacity(logits, factor)
+            increment_version(logits)
+            return
+        # of f s(x): log f - log(e^-x + 1 - f)
         decayed = math.log(factor) - torch.logaddexp(-logits, logits.new_full((), 1.0 - factor).log())
         logits.copy_(decayed if rows is None else torch.where(rows.to(logits.device), decayed, logits))
 
@@ -260,12 +278,16 @@ class Densifier:
             raise ArgumentError(f"projected: expected means2d.{name}, got None: {why}, {order}")
         return gradient
 
-    def _check(self) -> None:
-        """Raise a ValueError if the model, its statistics and the optimizer's state do not belong together."""
+    def _check_count(self) -> None:
+        """Raise a ValueError if the model has another number of Gaussians than the statistics."""
         count = len(self.model)
         expected = len(self._statistics["counts"])
         if count != expected:
             raise ArgumentError(f"model: expected {expected} Gaussians, got {count}; load the densifier's state too")
+
+    def _check(self) -> None:
+        """Raise a ValueError if the model, its statistics and the optimizer's state do not belong together."""
+        self._check_count()
         held = {id(parameter) for group in self.optimizer.param_groups for parameter in group["params"]}
         for name, parameter in self.model.named_parameters():
             if id(parameter) not in held:

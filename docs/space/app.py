@@ -107,7 +107,7 @@ def make(photos: list[str] | None, command: Sequence[str] = KGS) -> Iterator[tup
 
 def said(job: Path) -> str:
     """The end of what the command said: of each stage its last line, no suggestions of further commands."""
-    text = (job / "log").read_text(encoding="utf-8", errors="replace").partition("\nnext:\n")[0].rstrip()
+    text = (job / "log").read_text(encoding="utf-8", errors="replace").partition("\nnext: ")[0].rstrip()
     return "\n".join(re.sub(r"^(.+: )\d+ of \d+ .*\n(?=\1\d+ of )", "", text, flags=re.M).splitlines()[-20:])
 
 

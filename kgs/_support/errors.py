@@ -18,6 +18,11 @@ def listed(names: Sequence[object], max_names: int = 3) -> str:
     return f"{text} and {more} more" if more > 0 else text
 
 
+def quantity(number: int, noun: str) -> str:
+    """A number and a noun, whose plural has an s: as "1 photo" and "2 photos"."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
 def warn(message: str, category: type[Warning] = UserWarning) -> None:
     """Warn at the line that called kgs: the innermost one that is neither in kgs nor in torch."""
     names = [call.frame.f_globals.get("__name__", "") for call in inspect.stack(context=0)]

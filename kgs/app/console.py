@@ -5,6 +5,7 @@ import os
 import shlex
 import sys
 import time
+import webbrowser
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -12,9 +13,25 @@ from typing import Any, TextIO
 
 from kgs._support.errors import printable
 
-_FIRST_LINE = 10.0  # seconds after which a stage has a line, where there is no terminal
-_NEXT_LINE = 30.0  # seconds between two lines
+_FIRST_LINE = (
+    30.0  # seconds after which a stage has a line, where there is no terminal; the next one after twice as many
+)
 VIEWER = "open {} in a viewer of 3DGS files, for example superspl.at/editor in a browser"  # a step to suggest
+
+
+_is_quiet = False
+
+
+@contextmanager
+def quiet(is_quiet: bool) -> Iterator[None]:
+    """Leave out in this block, if asked to, what is said on stdout, and progress; errors and warnings stay."""
+    global _is_quiet
+    before = _is_quiet
+    _is_quiet = is_quiet
+    try:
+        yield
+    finally:
+        _is_quiet = before
 
 
 def say(line: str, file: TextIO | None = None) -> None:
@@ -22,6 +39,8 @@ def say(line: str, file: TextIO | None = None) -> None:
 
     Control characters, and letters that the stream cannot encode, become escapes. A closed pipe is no error.
     """
+    if file is None and _is_quiet:
+        return
     stream = sys.stdout if file is None else file
     line = "\n".join(map(printable, line.split("\n")))
     with suppress(OSError, ValueError, AttributeError):  # closed by its reader or by the program, or None
@@ -29,14 +48,27 @@ def say(line: str, file: TextIO | None = None) -> None:
         print(line.encode(encoding, "backslashreplace").decode(encoding), file=stream, flush=True)
 
 
-def say_next(*steps: str) -> None:
-    """Suggest next commands to the user."""
-    say("\n  ".join(["next:", *steps]))
+def say_next(first: str, *others: str) -> None:
+    """Suggest next steps to the user; off a terminal the first one alone."""
+    say("\n  ".join(["next:", first, *others]) if others and is_terminal() else f"next: {first}")
+
+
+def is_terminal() -> bool:
+    """Whether somebody reads stdout as it is written."""
+    with suppress(OSError, ValueError, AttributeError):  # closed, or None
+        return sys.stdout.isatty()
+    return False
+
+
+def open_in_browser(page: Path) -> None:
+    """Open a page in the user's browser; a line says so where there is none."""
+    if not webbrowser.open(page.resolve().as_uri()):
+        say(f"kgs: no browser was found: open {printable(page)} yourself", sys.stderr)
 
 
 @contextmanager
 def log_shown() -> Iterator[None]:
-    """Print what the library's log says, a line each, on stderr."""
+    """Print what the library's log says of its progress, a line each, on stderr."""
     log = logging.getLogger("kgs")
     level = log.level
     handler = _Lines()
@@ -51,7 +83,8 @@ def log_shown() -> Iterator[None]:
 
 class _Lines(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
-        say(f"kgs: {record.getMessage()}", sys.stderr)
+        if not _is_quiet:
+            say(f"kgs: {record.getMessage()}", sys.stderr)
 
 
 def as_line(*words: object) -> str:
@@ -80,10 +113,10 @@ def _escaped(letter: str) -> str:
 
 @contextmanager
 def progress(total: int, title: str, done: int = 0, unit: str = "step") -> Iterator[Callable[..., None]]:
-    """Show the progress of a stage of `total` units on stderr: a bar on a terminal, else a line every half minute.
+    """Show the progress of a stage of `total` units on stderr: a bar on a terminal, else a few lines.
 
-    Both have the time that is left. Off a terminal, in a file or a pipe, the first line comes after ten seconds, and a
-    short stage has none.
+    Both have the time that is left. Off a terminal, in a file or a pipe, lines come after half a minute, 1, 2, 4, ...
+    minutes. The first unit, in which kernels may be compiled, tells nothing about the time of the others.
 
     Args:
         total: number of units; with 0 nothing is shown.
@@ -95,27 +128,34 @@ def progress(total: int, title: str, done: int = 0, unit: str = "step") -> Itera
         `advance(note="")`, to be called after each unit. The note is shown behind the figures.
     """
     bar: Any = None
+    if _is_quiet:
+        yield lambda note="": None
+        return
     with suppress(OSError, ValueError, AttributeError, ImportError):  # no tqdm, or a stderr that is closed
         if sys.stderr.isatty():
             from tqdm import tqdm
 
             bar = tqdm(total=total, initial=done, desc=title, unit=unit, mininterval=0.5, file=sys.stderr)
-    before = done
     begin = time.monotonic()
     due = _FIRST_LINE
+    first = 0.0  # seconds of the first unit
+    units = 0
 
     def advance(note: str = "") -> None:
-        nonlocal done, due
+        nonlocal done, due, first, units
         done += 1
+        units += 1
         if bar is not None:
             with suppress(OSError, ValueError):
                 bar.set_postfix_str(note, refresh=False)
                 bar.update()
             return
         seconds = time.monotonic() - begin
-        if seconds >= due:
-            due = seconds + _NEXT_LINE
-            left = seconds / (done - before) * (total - done)
+        if units == 1:
+            first = seconds
+        if seconds >= due and units > 1:
+            due = 2 * seconds
+            left = (seconds - first) / (units - 1) * (total - done)
             parts = [f"{title}: {done} of {total} {unit}s"]
             if left > 1:
                 parts.append(f"{left:.0f} s left" if left < 100 else f"{left / 60:.1f} minutes left")

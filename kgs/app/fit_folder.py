@@ -193,10 +193,9 @@ def _trainer(
         say(f"{printable(out)}: keeps its {_state(out)}, until {until}; to go on with it, use --resume")
     stages.begin("initial points")
     points = choose_points(scene, config, each)
-    say(f"initial points: {len(points.points)} ({points.kind})")
     plan = decide(plan, points)
     memory = expected_memory(scene, gaussian_limit(plan.config, len(points.points)))
-    say(f"the fit takes up to {memory / 2**30:.1f} GiB of memory")
+    say(f"initial points: {len(points.points)} ({points.kind}); the fit takes up to {memory / 2**30:.1f} GiB of memory")
     return Trainer(scene, plan, points)
 
 

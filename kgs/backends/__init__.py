@@ -15,12 +15,22 @@ from torch import device as Device  # `import torch` would be taken for the fold
 
 from kgs._support.errors import ArgumentError
 
-from .base import Backend
+from .base import Backend, OptimizerStages
 from .cpu import CpuBackend
 from .gpu import GpuBackend
 from .torch import TorchBackend
 
-__all__ = ["BACKENDS", "Backend", "available", "check_backend", "choose", "former_or_auto", "resolve", "takes_kernels"]
+__all__ = [
+    "BACKENDS",
+    "Backend",
+    "available",
+    "check_backend",
+    "choose",
+    "former_or_auto",
+    "optimizer_stages",
+    "resolve",
+    "takes_kernels",
+]
 
 # "auto" takes the first that covers a call and is trusted
 BACKENDS: tuple[Backend, ...] = (CpuBackend(), GpuBackend(), TorchBackend())
@@ -82,6 +92,17 @@ def choose(name: str, stage: str, device: Device, covers: Callable[[Backend], bo
         if name in ("auto", backend.name) and covers(backend) and _may_take(backend, name, device):
             return backend
     raise ArgumentError(f'backend: {name!r} does not cover this call of {stage}, expected "auto" or "torch"')
+
+
+def optimizer_stages(name: str, like: Tensor) -> OptimizerStages | None:
+    """What a backend has for an optimizer of parameters like this one; None where torch does it.
+
+    Raises:
+        ValueError: the backend does not exist, or it is named and does not cover such a tensor.
+        ModuleNotFoundError: it is named and not installed.
+    """
+    chosen = choose(name, "optimizer", like.device, lambda backend: backend.covers(like))
+    return chosen.optimizer if chosen.has_optimizer else None
 
 
 def takes_kernels(name: str, stage: str, like: Tensor) -> bool:

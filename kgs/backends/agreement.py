@@ -10,11 +10,12 @@ from torch import Tensor
 from kgs.camera import image_size, pinhole_cameras
 from kgs.types import Gaussians, RasterOptions
 
-from .base import Backend, CompositingCall, CompositingInputs
+from .base import AdamUpdate, Backend, CompositingCall, CompositingInputs
 from .torch import TorchBackend
 
 BOUND = 5e-5  # a larger disagreement is no rounding
 _WINDOW, _SIGMA, _WEIGHT = 11, 1.5, 0.2  # of the loss
+_BETAS, _ADAM_EPS, _LR, _STEPS = (0.9, 0.999), 1e-15, 0.01, 3.0  # of Adam
 # thresholds: a layer that counts for one backend alone must not matter
 _OPTIONS = RasterOptions(tile_size=8, alpha_threshold=1e-6, transmittance_stop=1e-5)
 
@@ -61,13 +62,19 @@ def disagreement(backend: Backend, device: torch.device, steps: tuple[Step, ...]
     exact = [value for step in steps for value in _render(TorchBackend(), reference_device, step)]
     if backend.has_loss:
         exact += _exact_loss()
+    if backend.has_optimizer:
+        exact += _exactly_optimized()
     return max(_relative(value, expected) for value, expected in zip(found, exact, strict=True))
 
 
 def _run(backend: Backend, device: torch.device, steps: tuple[Step, ...]) -> list[Tensor]:
     """What a backend finds."""
     found = [value for step in steps for value in _render(backend, device, step)]
-    return found + list(_loss(backend, device) if backend.has_loss else ())
+    if backend.has_loss:
+        found += _loss(backend, device)
+    if backend.has_optimizer:
+        found += _optimized(backend, device)
+    return found
 
 
 def _random(*shape: int, low: float = -1.0, high: float = 1.0, seed: int = 0) -> Tensor:
@@ -137,6 +144,42 @@ def _exact_loss() -> tuple[Tensor, Tensor]:
     image = image.requires_grad_()
     loss = (image - target).abs().mean() + 2 * _WEIGHT * ssim_loss(image, target, _WINDOW)
     return loss, torch.autograd.grad(loss, image)[0]
+
+
+def _parameters() -> list[Tensor]:
+    """A parameter, its gradient, and its moments."""
+    gradient, average, square = (_random(40, 3, seed=seed) for seed in (9, 10, 11))
+    return [_random(40, 3, seed=8), gradient, average, square.abs()]
+
+
+def _optimized(backend: Backend, device: torch.device) -> list[Tensor]:
+    """What is left of a step of Adam for six parameters, of statistics of densification, and of a decay of logits."""
+    updates = []
+    for _ in range(6):
+        parameter, gradient, average, square = (x.to(device, torch.float32) for x in _parameters())
+        updates.append(AdamUpdate(parameter, gradient, average, square, _LR, _STEPS))
+    backend.optimizer.adam(updates, _BETAS, _ADAM_EPS)
+    logits = _parameters()[-1][:, 0].to(device, torch.float32).contiguous()
+    sums, counts = logits.clone(), torch.zeros(40, dtype=torch.int64, device=device)
+    ids = torch.arange(0, 40, 2, device=device)
+    backend.optimizer.add_gradient_norms(sums, counts, ids, gradient[:20, :2].contiguous(), (0.5, 2.0))
+    backend.optimizer.decay_opacity(logits, 0.9)
+    return [updates[-1].parameter, updates[0].exp_avg, updates[0].exp_avg_sq, sums, counts, logits]
+
+
+def _exactly_optimized() -> list[Tensor]:
+    """The same by its formulas."""
+    parameter, gradient, average, square = _parameters()
+    beta1, beta2 = _BETAS
+    logits = square[:, 0]
+    norms, counts = torch.zeros_like(logits), torch.zeros_like(logits)
+    norms[::2] = (gradient[:20, :2] * torch.tensor([0.5, 2.0], device="cpu")).norm(dim=1)
+    counts[::2] = 1.0
+    average = beta1 * average + (1.0 - beta1) * gradient
+    square = beta2 * square + (1.0 - beta2) * gradient.square()
+    root = (square / (1.0 - beta2**_STEPS)).sqrt() + _ADAM_EPS
+    parameter = parameter - _LR / (1.0 - beta1**_STEPS) * average / root
+    return [parameter, average, square, logits + norms, counts, (0.9 * logits.sigmoid()).logit()]
 
 
 def _relative(value: Tensor, expected: Tensor) -> float:

@@ -119,6 +119,38 @@ class MomentsStage(Protocol):
         """Mean and variance under the window with these taps, each `(1, B C, H, W)`, of `(B, C, H, W)`."""
 
 
+class AdamUpdate(NamedTuple):
+    """What a step of Adam changes, and by what: four tensors of one shape, contiguous but for the gradient."""
+
+    parameter: Tensor
+    gradient: Tensor
+    exp_avg: Tensor
+    exp_avg_sq: Tensor
+    lr: float
+    step: float  # from 1: this one counts
+
+
+class OptimizerStages(ABC):
+    """What a fit does with the gradients, in place."""
+
+    @abstractmethod
+    def adam(self, updates: list[AdamUpdate], betas: tuple[float, float], eps: float) -> None:
+        """Change parameters and moments as `kgs.fit.adam.Adam` does."""
+
+    @abstractmethod
+    def add_gradient_norms(
+        self, sums: Tensor, counts: Tensor, ids: Tensor, gradient: Tensor, scale: tuple[float, float]
+    ) -> None:
+        """Add the norms of gradients `(M, 2)`, times a scale in x and y, to `sums`, `(N,)`, and 1 to `counts`, `(N,)`.
+
+        `ids`, `(M,)`, are the rows, each there once at most. See `kgs.Densifier.observe`.
+        """
+
+    @abstractmethod
+    def decay_opacity(self, logits: Tensor, factor: float) -> None:
+        """Multiply the opacities with these logits, `(N,)`, contiguous, by a factor in (0, 1)."""
+
+
 class Backend(ABC):
     """An implementation of the renderer. Torch defines what is right; others give the same within rounding.
 
@@ -132,6 +164,7 @@ class Backend(ABC):
         package: what must be installed beside torch, and how to install it; None for nothing.
         has_loss: whether it has `loss_and_gradient`.
         has_moments: whether it has `local_moments`.
+        has_optimizer: whether it has `optimizer`.
     """
 
     name: str
@@ -141,6 +174,7 @@ class Backend(ABC):
     package: tuple[str, str] | None = None
     has_loss = False
     has_moments = False
+    has_optimizer = False
 
     def is_installed(self) -> bool:
         """Whether the package it needs is there; does not import it."""
@@ -192,6 +226,11 @@ class Backend(ABC):
     def local_moments(self) -> MomentsStage:
         """Its moments of a target, where it has them."""
         raise NotImplementedError(f"{self.name} has no local moments")
+
+    @property
+    def optimizer(self) -> OptimizerStages:
+        """Its stages of an optimizer, where it has them."""
+        raise NotImplementedError(f"{self.name} has no stages of an optimizer")
 
 
 @functools.cache

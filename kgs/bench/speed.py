@@ -17,6 +17,7 @@ from kgs._support.machine import check_device, peak_rss_mb
 from kgs.backends import resolve
 from kgs.backends.torch.binning import bin_to_tiles
 from kgs.camera import move_camera
+from kgs.fit.adam import Adam
 from kgs.losses import photometric_loss, target_moments
 from kgs.renderer import GaussianRenderer
 from kgs.stages import composite, project
@@ -112,10 +113,19 @@ class Cases:
         self.weights = torch.rand(1, 3, *size, generator=generator).to(device) / math.prod(size)
         self.photo = torch.rand(1, 3, *size, generator=generator).to(device)
         self.moments = target_moments(self.photo)
-        self.optimizer = torch.optim.Adam(self.model.parameters(), lr=0.0, fused=True)
+        self._optimizers: dict[str, Adam] = {}
         with torch.no_grad():
             bins = bin_to_tiles(project(self.model(), self.camera))
         self.pairs = bins.entries.shape[0] * bins.tile_size**2 / 1e6
+
+    @property
+    def optimizer(self) -> Adam:
+        """That of a fit with this backend; it changes nothing."""
+        backend = self.renderer.backend
+        if backend not in self._optimizers:
+            groups = [{"params": [x], "name": name, "lr": 0.0} for name, x in self.model.named_parameters()]
+            self._optimizers[backend] = Adam(groups, backend=backend)
+        return self._optimizers[backend]
 
     def of(self, table: str) -> dict[str, Case]:
         """What a table compares."""
@@ -157,7 +167,7 @@ class Cases:
         backend = self.renderer.backend
         photometric_loss(image.clamp(0, 1), self.photo, 0.2, moments=self.moments, backend=backend).backward()
         self.optimizer.step()
-        self.optimizer.zero_grad(set_to_none=True)
+        self.optimizer.zero_grad()
 
     def stages(self) -> Iterator[str]:
         """A training step in its parts; says the name of each when it is done."""
@@ -176,7 +186,7 @@ class Cases:
         torch.autograd.backward(outputs, grads)
         yield "projection, harmonics, backward"
         self.optimizer.step()
-        self.optimizer.zero_grad(set_to_none=True)
+        self.optimizer.zero_grad()
         yield "Adam"
 
     def savings(self) -> dict[str, Case]:

@@ -8,9 +8,14 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.graph import increment_version
 
 from kgs._support.errors import ArgumentError
 from kgs._support.torch_threads import torch_on_all_threads
+from kgs.backends import optimizer_stages
+from kgs.backends.base import AdamUpdate
+
+_BETAS = (0.9, 0.999)
 
 
 class Adam:
@@ -21,41 +26,59 @@ class Adam:
     Args:
         groups: dicts with a parameter, `params=[parameter]`, its `name`, and its learning rate `lr`.
         eps: added to the root of the second moment.
+        backend: "triton" changes all contiguous parameters in one kernel, with other bits.
 
     Attributes:
         param_groups: the groups; `lr` may be changed before each step.
-        state: for each parameter its `step`, `exp_avg` and `exp_avg_sq`; empty before its first gradient.
+        state: for each parameter its `step`, a number, `exp_avg` and `exp_avg_sq`; empty before its first gradient.
     """
 
-    def __init__(self, groups: list[dict[str, Any]], eps: float = 1e-8) -> None:
+    def __init__(self, groups: list[dict[str, Any]], eps: float = 1e-8, backend: str = "torch") -> None:
         self.param_groups = groups
         self.state: defaultdict[Tensor, Any] = defaultdict(dict)
         self.eps = eps
+        self._stages = optimizer_stages(backend, groups[0]["params"][0])
 
-    @torch_on_all_threads()
-    @torch.no_grad()
     def step(self) -> None:
         """Change each parameter that has a gradient."""
+        by_kernel = list[AdamUpdate]()
+        by_torch = list[AdamUpdate]()
         for group in self.param_groups:
             [parameter] = group["params"]
-            if parameter.grad is None:
+            gradient = parameter.grad
+            if gradient is None:
                 continue
             state = self.state[parameter]
             if not state:
-                state["step"] = torch.zeros((), dtype=torch.float32, device=parameter.device)
+                state["step"] = 0.0
                 state["exp_avg"] = torch.zeros_like(parameter)
                 state["exp_avg_sq"] = torch.zeros_like(parameter)
-            state["step"] += 1
+            state["step"] += 1.0
+            update = AdamUpdate(parameter, gradient, state["exp_avg"], state["exp_avg_sq"], group["lr"], state["step"])
+            covered = self._stages is not None and parameter.is_contiguous()
+            (by_kernel if covered else by_torch).append(update)
+        if by_torch:
+            self._step_by_torch(by_torch)
+        if self._stages is not None and by_kernel:
+            self._stages.adam(by_kernel, _BETAS, self.eps)
+            for update in by_kernel:
+                increment_version(update.parameter)
+
+    @torch_on_all_threads()
+    @torch.no_grad()
+    def _step_by_torch(self, updates: list[AdamUpdate]) -> None:
+        beta1, beta2 = _BETAS
+        for parameter, gradient, exp_avg, exp_avg_sq, lr, step in updates:
             torch._fused_adam_(
                 [parameter],
-                [parameter.grad],
-                [state["exp_avg"]],
-                [state["exp_avg_sq"]],
+                [gradient],
+                [exp_avg],
+                [exp_avg_sq],
                 [],
-                [state["step"]],
-                lr=group["lr"],
-                beta1=0.9,
-                beta2=0.999,
+                [_as_tensor(step, parameter)],
+                lr=lr,
+                beta1=beta1,
+                beta2=beta2,
                 weight_decay=0.0,
                 eps=self.eps,
                 amsgrad=False,
@@ -69,7 +92,14 @@ class Adam:
 
     def state_dict(self) -> dict[str, dict[str, Tensor]]:
         """Step and moments of each parameter by the name of its group; an empty dict before its first gradient."""
-        return {group["name"]: self.state.get(group["params"][0], {}) for group in self.param_groups}
+        found = {}
+        for group in self.param_groups:
+            [parameter] = group["params"]
+            state = dict(self.state.get(parameter, {}))
+            if state:
+                state["step"] = _as_tensor(state["step"], parameter)
+            found[group["name"]] = state
+        return found
 
     def load_state_dict(self, state: dict[str, dict[str, Tensor]]) -> None:
         """Continue from a :meth:`state_dict`.
@@ -92,5 +122,10 @@ class Adam:
                     f"optimizer: expected a step and two moments of shape {tuple(parameter.shape)} for "
                     f"{group['name']}, the second not negative, got shapes {given}"
                 )
-            moments = {name: loaded[name].to(parameter, copy=True) for name in ("exp_avg", "exp_avg_sq")}
-            self.state[parameter] = {"step": loaded["step"].to(parameter.device, torch.float32, copy=True), **moments}
+            moments = {name: torch.empty_like(parameter).copy_(loaded[name]) for name in ("exp_avg", "exp_avg_sq")}
+            self.state[parameter] = {"step": float(loaded["step"]), **moments}
+
+
+def _as_tensor(step: float, parameter: Tensor) -> Tensor:
+    """The number of steps as torch's Adam has it, 0-d."""
+    return torch.full((), step, dtype=torch.float32, device=parameter.device)

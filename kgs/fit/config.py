@@ -61,7 +61,8 @@ class Recipe:
         densify_from: no densification up to this step.
         densify_interval: steps between two densifications.
         grad_threshold: least mean gradient, in normalised device coordinates, of a Gaussian that is densified.
-        absgrad: whether gradients of each pixel count by their absolute values (AbsGS), about four times as large.
+        absgrad: False: gradients of pixels are added with their signs, instead of their absolute values (AbsGS), which
+            are about four times as large.
         percent_dense: largest scale, as a fraction of the extent, of a Gaussian that is cloned; larger ones are split.
         prune_opacity: Gaussians below this opacity are removed.
         opacity_decay: factor on all opacities after each step, in (0, 1]; it does not depend on the number of steps.
@@ -133,8 +134,8 @@ class FitConfig:
         exposure: whether each training photo has a gain in each channel, which is estimated before the fit and held.
             auto: where photos differ by a factor of 1.3 or more, and gains explain it. each: always, if the initial
             points are dense. same: never.
-        refine_poses: optimise the poses of the training cameras too. It helps if they are half a degree or more off;
-            accurate poses get slightly worse. The mean and the spread of the poses stay, and so do test cameras.
+        refine_poses: optimise the poses of the training cameras too, for poses that are half a degree or more off;
+            accurate ones get slightly worse. Their mean and spread stay.
         coarse: share of the steps, from the start, that use the training views at half the width; in [0, 1]. Unless
             given: 0, and half of them for unposed photos at the size that kgs fit chooses.
         seed: of everything random: initial points, order of views, backgrounds, splits and drop masks.
@@ -152,7 +153,7 @@ class FitConfig:
             of the background's colour. scene: the background of the scene, as in test views.
         max_gaussians: largest number of Gaussians, at which densification stops. Unless given: 10 per step, and at
             least 1.5 times the number of initial points.
-        prune: whether Gaussians that no training view shows are removed, and harmonics that change no image.
+        prune: False: Gaussians that no training view shows stay, and so do harmonics that change no image.
         max_bytes: bound on the working memory of a render, in bytes; it changes results only by rounding. Unless given:
             that of `kgs.RasterOptions`.
         evaluations: how often the PSNR curve is measured, the last time at the end.

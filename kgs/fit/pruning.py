@@ -91,17 +91,17 @@ def contributions(model: GaussianModel, views: Views, options: RasterOptions, ba
 
 
 def left_out(decisions: Decisions) -> str:
-    """What a fit left out, in words for the last line of its output; "" if that is nothing."""
+    """What a fit left out and why, in words for its output and its page; "" if that is nothing."""
     parts = []
     degree = decisions.sh_degree
     if degree is not None and degree.chosen == 0:
-        why = degree.why if degree.gain is None else f"they can gain {degree.gain:+.2f} dB"
-        parts.append(f"harmonics ({why or 'by rule'})")
+        why = degree.why if degree.gain is None else f"harmonics could gain {degree.gain:.2f} dB"
+        parts.append(f"each colour is the same from all directions: {why or 'by rule'}")
     overlap = decisions.overlap
     if overlap is not None and overlap.drop == 0:
-        parts.append(f"dropping (on average {overlap.views_per_pair:.1f} photos show two patches of surface together)")
+        parts.append(f"DropGaussian is off: each point is seen by {overlap.views_per_patch:.1f} photos on average")
     gaussians = decisions.gaussians
     share = 0.0 if gaussians is None else 1 - gaussians.kept / max(gaussians.fitted, 1)
     if share >= 0.005:
-        parts.append(f"{100 * share:.0f} % of the Gaussians, which no training photo needs")
-    return ", ".join(parts)
+        parts.append(f"{100 * share:.0f} % of the Gaussians are removed: no photo needs them")
+    return "; ".join(parts)

@@ -108,7 +108,7 @@ class TrainState:
             {"params": [model.get_parameter(name)], "lr": getattr(recipe, f"lr_{rate}"), "name": name}
             for name, rate in _LEARNING_RATES.items()
         ]
-        optimizer = Adam(groups, eps=recipe.adam_eps)
+        optimizer = Adam(groups, eps=recipe.adam_eps, backend=plan.backend)
         drop = None
         rate = DROP if config.drop is None else config.drop
         if rate:
@@ -123,6 +123,7 @@ class TrainState:
             prune_opacity=recipe.prune_opacity,
             max_gaussians=gaussian_limit(config, start.init["points"]),
             generator=torch.Generator().manual_seed(seed + 2),
+            backend=plan.backend,
         )
         poses = None
         if config.refine_poses:

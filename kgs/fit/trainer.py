@@ -243,8 +243,9 @@ class Trainer:
             backend = resolve(values["backend"] if runs else "auto", plan.device)
             decisions = Decisions.from_dict(values["decisions"])
             exposed = with_exposure(self._input_scene, decisions)
+        plan = replace(plan, backend=backend, decisions=decisions)
         state = TrainState.from_dict(self._input_scene, plan, values)
-        self.plan = replace(plan, backend=backend, decisions=decisions)
+        self.plan = plan
         state.notes += longer
         self._use(state, exposed)
 

@@ -194,5 +194,8 @@ def as_text(metrics: dict[str, Any]) -> str:
         percent = 100 * coverage["share"]
         lines.append(f" test: {percent:.0f} % is in two training views, PSNR {level:.4g}; the rest {rest:.4g}")
     if not metrics["test"]:
-        lines.append("no photo was held out: the quality of other views was not measured (see --hold-out)")
+        lines.append(
+            "no photo was held out: how good other views are was not measured (--hold-out). "
+            "Every fit comes close to its own photos."
+        )
     return "\n".join(lines)

@@ -48,7 +48,7 @@ def test_a_file_keeps_its_degree_and_its_tag(fitted, folder, tmp_path, capsys):
     model = planted(fitted / "splat.ply", tmp_path / "planted.ply")
     assert run("clean", tmp_path / "planted.ply", "--cameras", folder, "-o", tmp_path / "clean.ply") == 0
     said = capsys.readouterr().out
-    assert "1 giants" in said
+    assert "1 giant," in said
     assert "train: PSNR" in said
     cleaned = load_ply(tmp_path / "clean.ply")
     assert (cleaned.sh_degree, cleaned.antialiased) == (1, True)

@@ -112,7 +112,7 @@ MISTAKES = [  # words, what is said of them, and a package that is not installed
     ("fit photos -o out --hold-out 1", "--hold-out: expected", ""),
     ("fit photos -o out --lpips-weights empty", "empty/vgg16_features.npz: expected", ""),
     ("fit photos -o photos", "photos: holds photos or files of a scene", ""),
-    ("fit missing -o out", "missing: expected", ""),
+    ("fit missing -o out", "missing: no such file or folder", ""),
     ("fit empty -o out", "empty: expected photos", ""),
     ("fit two -o out", "two: expected at least 3 photos, found 2", ""),
     ("fit poses -o out", "poses: has camera poses but no photos", ""),
@@ -127,11 +127,11 @@ MISTAKES = [  # words, what is said of them, and a package that is not installed
     ("demo -o out --size 31", "--size: expected", ""),
     ("demo -o out --scene garden", "--scene", ""),
     ("render taken/splat.ply --cameras empty -o out", "empty: is not a scene", ""),
-    ("render missing --cameras photos -o out", "missing: expected", ""),
+    ("render missing --cameras photos -o out", "missing: no such file or folder", ""),
     ("eval empty", "empty/config.json: cannot be read", ""),
-    ("eval missing", "missing: expected", ""),
+    ("eval missing", "missing: no such file or folder", ""),
     ("page taken/splat.ply --cameras poses -o out", "--out: expected a file that ends in .html", ""),
-    ("study -o out --lpips-weights missing", "missing: expected", ""),
+    ("study -o out --lpips-weights missing", "missing: no such file or folder", ""),
 ]
 RUN_ALL = """
 for words, said, package in json.load(sys.stdin):

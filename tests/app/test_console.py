@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from kgs._support.errors import DataError
-from kgs.app.console import as_line, progress, say
+from kgs.app.console import as_line, open_in_browser, progress, quiet, say, say_next
 
 
 class Terminal(io.StringIO):
@@ -15,29 +15,16 @@ class Terminal(io.StringIO):
         return True
 
 
-LEFT = {1: ", 1.8 minutes left", 4: ", 72 s left", 7: ", 36 s left", 10: ""}
-
-
 @pytest.mark.parametrize(
     ("total", "done", "seconds", "told"),
     [
-        (200, 50, [0.05] * 150, []),  # less than ten seconds
-        (1000, 500, [1.0] * 60, ["510 of 1000 steps, 8.2 minutes left", "540 of 1000 steps, 7.7 minutes left"]),
-        (
-            10,
-            0,
-            [12.0] * 10,
-            [
-                "1 of 10 steps, 1.8 minutes left",
-                *(f"{i} of 10 steps, {120 - 12 * i} s left" for i in (4, 7)),
-                "10 of 10 steps",
-            ],
-        ),
+        (200, 50, [0.1] * 150, []),  # less than half a minute
+        (1000, 500, [1.0] * 70, ["530 of 1000 steps, 7.8 minutes left", "560 of 1000 steps, 7.3 minutes left"]),
+        (10, 0, [12.0] * 10, [f"{i} of 10 steps, {120 - 12 * i} s left" for i in (3, 6)]),
+        (10, 0, [40.0] + [2.0] * 9, ["2 of 10 steps, 16 s left"]),  # kernels are compiled in the first step
     ],
 )
-def test_without_a_terminal_a_line_every_half_minute_with_the_time_that_is_left(
-    capsys, monkeypatch, total, done, seconds, told
-):
+def test_without_a_terminal_a_few_lines_with_the_time_that_is_left(capsys, monkeypatch, total, done, seconds, told):
     now = 100.0
     monkeypatch.setattr("kgs.app.console.time.monotonic", lambda: now)
     with progress(total, "fit", done=done) as advance:
@@ -87,3 +74,32 @@ def test_control_characters_in_names_become_escapes(capsys):
     assert as_line("kgs", "a b", "it's\na \\") == r"kgs 'a b' $'it\'s\na \\'"
     assert as_line("d\udcff \x85é") == r"$'d\xff \xc2\x85é'"
     assert as_line("kgs", Path("./-a"), "-o", Path("b")) == "kgs ./-a -o b"
+
+
+def test_quiet_leaves_errors_and_warnings(capsys):
+    with quiet(True):
+        say("a")
+        say_next("b", "c")
+        say("wrong", sys.stderr)
+        with progress(2, "fit") as advance:
+            advance("loss=0.1")
+    say("d")
+    said = capsys.readouterr()
+    assert (said.out, said.err) == ("d\n", "wrong\n")
+
+
+def test_off_a_terminal_the_first_step_alone_is_suggested(capsys, monkeypatch):
+    say_next("a", "b")
+    assert capsys.readouterr().out == "next: a\n"
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    say_next("a", "b")
+    assert capsys.readouterr().out == "next:\n  a\n  b\n"
+
+
+@pytest.mark.parametrize("has_browser", [True, False])
+def test_a_page_is_opened_in_a_browser(tmp_path, monkeypatch, capsys, has_browser):
+    opened = []
+    monkeypatch.setattr("kgs.app.console.webbrowser.open", lambda url: opened.append(url) or has_browser)
+    open_in_browser(tmp_path / "my page.html")
+    assert opened == [f"{tmp_path.as_uri()}/my%20page.html"]
+    assert ("no browser was found" in capsys.readouterr().err) != has_browser

@@ -159,9 +159,9 @@ def test_sizes_that_cannot_be_fitted_and_photos_of_others_are_refused(demo, fold
         assert "--size: expected at least 32 pixels, got 31" in one_line(capsys)
     (tmp_path / "images").mkdir()
     (tmp_path / "images" / "mine.jpg").touch()
-    assert run("demo", "-o", tmp_path) == 2
+    assert run("demo", "-o", tmp_path) == 3
     assert "holds images/mine.jpg, which this command did not write" in one_line(capsys)
-    assert run("fit", folder, "-o", demo) == 2
+    assert run("fit", folder, "-o", demo) == 3
     assert "choose another folder" in one_line(capsys)
     assert [path.name for path in tmp_path.iterdir()] == ["images"]
 
@@ -170,7 +170,7 @@ def test_the_room_is_a_scene_without_photos_of_others(tmp_path, capsys):
     for resume in ((), ("--resume",)):
         assert run("demo", "-o", tmp_path, "--scene", "room", "--steps", 2, *TINY, *resume) == 0
         said = capsys.readouterr().out
-        assert "3 training and 3 test views of 40x30" in said
+        assert "3 training photos of 40x30, 3 held out" in said
         assert ("resumed at step 2" in said) == bool(resume)
         assert "dataset_banana" not in said + Path(tmp_path, "index.html").read_text(encoding="utf-8")
 

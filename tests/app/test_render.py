@@ -124,6 +124,6 @@ def test_a_page_of_any_splat(splat, llff, tmp_path, capsys, monkeypatch):
     assert all(f'alt="photo {name}"' in text for name in decoded[:6])
     assert text.count('<img alt="" src="data:image/jpeg') == 4
     assert "40 × 30 pixels" in text
-    assert "Whether the splat was fitted to these photos is not known here." in text
+    assert "If the splat was fitted to these photos, their PSNR says little about other views." in text
     assert f"open {out} in a browser" in capsys.readouterr().out
     page(splat, cameras=llff, out=out)  # its own file is written again

@@ -31,7 +31,7 @@ pytest.importorskip("pycolmap")
 def refused(capsys):
     """Runs `kgs fit` on a folder that is refused; the message. Nothing half-made is left behind."""
 
-    def run(folder, *parts, out=None, code=2, kept=False, options=()):
+    def run(folder, *parts, out=None, code=4, kept=False, options=()):
         results = out or folder.parent / "out"
         assert command("fit", folder, "-o", results, *options) == code
         assert kept or not [path.name for path in results.glob("*photos*")]
@@ -84,6 +84,8 @@ FOLDERS = {  # what is in them, and what is said of it
         lambda at: save(at, [], clip_MOV=VIDEO, other_mp4=VIDEO),
         ("several videos (clip.MOV, other.mp4): name one",),
     ),
+}
+REFUSED = {  # photos that can be read
     "one twice": (
         lambda at: save(at, [*planes()[:2], planes()[1]]),
         ("2.png: is the same photo as 1.png: ",),
@@ -93,7 +95,7 @@ FOLDERS = {  # what is in them, and what is said of it
         ("expected photos of one shape, got 2", "240x120: 2.png", "Cropped"),
     ),
 }
-SLOW_FOLDERS = {
+SLOW_REFUSED = {
     "one twice, saved again": (
         lambda at: save(at, [*small(planes()[:2]), *small(planes()[1:2])], ["0.png", "1.png", "2.jpg"]),
         ("1.png and 2.jpg match at the same pixels", "remove one of them"),
@@ -109,9 +111,16 @@ SLOW_FOLDERS = {
 }
 
 
-@pytest.mark.parametrize("kind", [*FOLDERS, *(pytest.param(kind, marks=pytest.mark.slow) for kind in SLOW_FOLDERS)])
+@pytest.mark.parametrize("kind", FOLDERS)
 def test_what_a_folder_holds_instead_is_told(tmp_path, refused, kind):
-    fill, said = (FOLDERS | SLOW_FOLDERS)[kind]
+    fill, said = FOLDERS[kind]
+    fill(tmp_path / "photos")
+    refused(tmp_path / "photos", *said, code=3)
+
+
+@pytest.mark.parametrize("kind", [*REFUSED, *(pytest.param(kind, marks=pytest.mark.slow) for kind in SLOW_REFUSED)])
+def test_why_photos_are_refused_is_told(tmp_path, refused, kind):
+    fill, said = (REFUSED | SLOW_REFUSED)[kind]
     fill(tmp_path / "photos")
     refused(tmp_path / "photos", *said)
 
@@ -121,7 +130,7 @@ def test_what_a_folder_holds_instead_is_told(tmp_path, refused, kind):
 def test_a_link_to_a_photo_that_is_gone(folder, refused, name):
     save(folder, small(planes()))
     (folder / name).symlink_to("gone")
-    refused(folder, f"links to files that are not there: {name}")
+    refused(folder, f"links to files that are not there: {name}", code=3)
 
 
 @pytest.mark.parametrize("heic", [True, False])
@@ -167,7 +176,7 @@ def fill_with_odd_ones(folder):
 
 def test_what_looks_like_a_photo_and_is_not_taken_is_named(folder, refused):
     fill_with_odd_ones(folder)
-    said = refused(folder.rename(folder.with_name("none")), "these folders in it do: more", "IMG_4")
+    said = refused(folder.rename(folder.with_name("none")), "these folders in it do: more", "IMG_4", code=3)
     fill_with_odd_ones(save(folder, planes()))
     assert [path.name for path in find_photos(folder)] == ["0.png", "1.png", "2.png"]
     said = " ".join(notes_on(folder))
@@ -309,14 +318,14 @@ def test_results_do_not_go_among_the_photos_or_over_another_scene(folder, tmp_pa
         (tmp_path / "scene", "files of a scene"),
         (tmp_path / "other", "did not write"),
     ):
-        refused(folder, "choose another folder", out=out)
+        refused(folder, "choose another folder", out=out, code=3)
         with pytest.raises(DataError, match=f"{said}.*choose another folder"):
             pose_photos(folder, out)
 
 
 def test_photos_that_lie_where_results_go_are_refused(tmp_path, refused):
     images = write_planes(tmp_path / "images")
-    refused(images, "choose another folder", out=tmp_path)
+    refused(images, "choose another folder", out=tmp_path, code=3)
     for path in images.iterdir():  # as renders of kgs are
         write_png(path, torch.rand(3, 8, 8))
     with replacing(images, "renders") as new:

@@ -21,7 +21,7 @@ SPACE = Path(__file__).parents[2] / "docs" / "space"
 
 # What the quick commands do; they get `photos -o out`.
 WRITES = "import os; os.mkdir('out'); [open(f'out/{n}', 'w').write('<p>') for n in ('index.html', 'splat.ply')]"
-LISTS = f"import os; print(*sorted(os.listdir('photos'))); {WRITES}; print('next:'); print('kgs render out')"
+LISTS = f"import os; print(*sorted(os.listdir('photos'))); {WRITES}; print('next: kgs render out')"
 STAGES = "photos: 1 of 2 photos\nphotos: 2 of 2 photos\n3 photos placed\nfit: 1 of 9 steps, 20 dB\nfit: 3 of 9 steps"
 FAILS = "import sys; sys.exit('kgs: photos: two solvers do not agree: <b>step</b> to the side')"
 KILLED = "import os; os.kill(os.getpid(), 9)"

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -77,7 +78,8 @@ def asked(truth, monkeypatch):
     return calls
 
 
-def test_a_folder_of_photos_becomes_a_fit(folder, tmp_path, capsys):
+def test_a_folder_of_photos_becomes_a_fit(folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     out = tmp_path / "out"
     photos = folder(4)
     (photos / "reconstruction.json").write_text("{}")
@@ -86,7 +88,7 @@ def test_a_folder_of_photos_becomes_a_fit(folder, tmp_path, capsys):
     stages = ["1 of 5: cameras", "2 of 5: initial points", "3 of 5: fit", "4 of 5: film", "5 of 5: page"]
     assert [line for line in said.splitlines() if " of 5: " in line] == stages
     assert said.index(stages[0]) < said.index("reconstruction.json is not used") < said.index(stages[1])
-    assert "4 training and 0 test views of 96x72" in said
+    assert "4 training photos of 96x72, none held out" in said
     assert "<title>photos4</title>" in (out / "index.html").read_text(encoding="utf-8")
     assert "no photo was held out" in said
     assert json.loads((out / "metrics.json").read_text())["test"] is None

@@ -74,7 +74,7 @@ def test_what_is_open_is_decided_by_the_patches(scene, photos):
     numbers = {"views_per_patch": pytest.approx(photos), "views_per_pair": pytest.approx(together, abs=0.01)}
     found = {"overlap": {**numbers, "patches": 1000, **chosen}}
     assert json.loads(json.dumps(plan.decisions.to_dict())) == found
-    assert ("dropping" in left_out(plan.decisions)) == (chosen["drop"] == 0)
+    assert ("DropGaussian is off" in left_out(plan.decisions)) == (chosen["drop"] == 0)
     assert (Trainer(scene, plan, points_seen_by(photos)).state.drop is None) == (chosen["drop"] == 0)
 
 

@@ -22,7 +22,7 @@ def kernels():
 @pytest.mark.parametrize("target", TARGETS)
 def test_the_kernels_of_a_training_step_compile_and_none_spills(kernels, target):
     spilled = spilled_bytes(kernels["training step"], target)
-    assert len(spilled) == len(kernels["training step"]) >= 18
+    assert len(spilled) == len(kernels["training step"]) >= 21
     assert not [pair for pair in spilled if pair[1] != 0]
 
 

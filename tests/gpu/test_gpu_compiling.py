@@ -43,8 +43,9 @@ def cases(size, count, absgrad=False, degree=3):
 def test_a_training_step_needs_no_kernel_that_the_check_does_not():
     """Whatever the number of Gaussians and the size of the image, divisible by 16 or not."""
     checked = forms(lambda: agreement._run(GpuBackend(), CPU, agreement.FITS))
-    assert len({name for name, _ in checked.values()}) >= 18
-    assert len(checked) <= 27
+    names = {name for name, _ in checked.values()}
+    assert len(names) >= 18
+    assert len(checked) <= len(names) + 8
     runs = [
         cases((24, 32), 100).train,
         cases((32, 16), 48, absgrad=True).train,

@@ -46,6 +46,7 @@ _CARD = pytest.param(Target("triton", torch.device("cuda")), id="triton on a car
 ALL_KERNELS = [_NUMBA, pytest.param(Target("triton"), id="triton interpreted"), _CARD]
 _SELDOM = [_NUMBA, pytest.param(Target("triton"), id="triton interpreted", marks=pytest.mark.slow), _CARD]
 SELDOM_INTERPRETED = pytest.mark.parametrize("kernels", _SELDOM, indirect=True)
+TRITON = pytest.mark.parametrize("kernels", ALL_KERNELS[1:], indirect=True)
 COMPILED = pytest.mark.parametrize("kernels", [_NUMBA, _CARD], indirect=True)
 
 

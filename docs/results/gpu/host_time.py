@@ -21,7 +21,7 @@ from typing import Any
 import torch
 
 GAUSSIANS, SIZE = 100, (24, 32)
-STAGES = ("compositing", "projection", "loss")
+STAGES = ("compositing", "projection", "loss", "optimizer")
 READS = ("tolist", "__int__")
 
 

@@ -36,7 +36,7 @@ def check_file(out: Path, ending: str, kind: str, source: Path | None = None) ->
     if source is not None and out.exists() and out.samefile(source):
         raise ArgumentError(f"out: expected another file than {str(source)!r}, which is read")
     if not out.absolute().parent.is_dir():
-        raise DataError(out, "", "expected a file in a folder that is there")
+        raise DataError(out, "", "no such folder to write it to")
     check_free(out.parent, kind, [out.name])
 
 

@@ -4,12 +4,12 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kgs._support.errors import ArgumentError, DataError, printable
+from kgs._support.errors import ArgumentError, DataError, printable, quantity
 from kgs.app.console import VIEWER, as_line, each, say, say_next
 from kgs.fit.config import Backend, Background
 
 from .checks import check_file, check_photos_of, check_results
-from .inputs import load_cameras, load_splat
+from .inputs import load_cameras, load_splat, options_of_fit
 from .options import IfGiven, Out
 from .tools import load_tools
 
@@ -103,7 +103,7 @@ def clean(
         fitted = len(whole)
     with replacing(out.parent, "clean") as new:
         save_ply(new / out.name, model, offset=offset)
-    kinds = ", ".join(f"{count} {kind}" for kind, count in removed.items())
+    kinds = ", ".join(quantity(count, kind.removesuffix("s")) for kind, count in removed.items())
     say(f"{printable(out)}: {len(model)} of {fitted} Gaussians; removed: {kinds}")
     if fit is None:
         say("no photo was compared, and floaters are the isolated ones alone: --cameras SCENE names the photos")
@@ -112,7 +112,10 @@ def clean(
     if cleaned.needed:
         say(f"{cleaned.needed} others stay: without them a training view would lose more than it may")
     _say_levels(fit, cleaned)
-    options = ["--downscale", f"{downscale:g}"] if downscale is not None and downscale > 1.0 else []
+    options = []
+    known = options_of_fit(out, SceneSource(fit.scene.root)).get("downscale")
+    if (downscale or 1.0) > 1.0 and downscale != known:
+        options += ["--downscale", f"{downscale:g}"]
     if background != "black":
         options += ["--background", background]
     say_next(as_line("kgs", "page", out, "--cameras", fit.scene.root, "-o", out.with_suffix(".html"), *options))

@@ -6,13 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from kgs._support.errors import printable
-from kgs.app.console import VIEWER, as_line, each, say, say_next
+from kgs._support.errors import printable, quantity
+from kgs.app.console import VIEWER, as_line, each, open_in_browser, say, say_next
 from kgs.datasets.folders import LAYOUT_FILES
 from kgs.fit.config import DEMO, DEMO_STEPS, ROOM_DEMO, Backend, FitConfig
 
 from .checks import check_side
-from .options import IfGiven, Out
+from .options import Flag, IfGiven, Open, Out
 from .tools import load_tools
 
 if TYPE_CHECKING:
@@ -31,9 +31,10 @@ def demo(
     scene: Literal["bananas", "room"] = "bananas",
     steps: int = DEMO_STEPS,
     size: IfGiven[int] = None,
-    compare: bool = False,
-    resume: bool = False,
+    compare: Flag = False,
+    resume: Flag = False,
     seed: int = 0,
+    open_page: Open = False,
     device: str = "auto",
     backend: Backend = "auto",
 ) -> int:
@@ -54,6 +55,7 @@ def demo(
             little.
         resume: continue a demo that was stopped.
         seed: of everything random: the room, the initial points and the fits.
+        open_page: open the page in a browser when the fit is done.
         device: auto: a GPU if kgs has kernels for it, else the CPU. Or cpu, cuda, cuda:1, ...
         backend: auto: the fastest that is installed. kgs fit --help-all describes the others.
     """
@@ -86,7 +88,7 @@ def demo(
     say(f"device: {device_name(found)}")
     request, loaded = _write_scene(scene, out, size, seed, resume)
     height, width = loaded.train.images.shape[-2:]
-    say(f"{len(loaded.train)} training and {len(loaded.test)} test views of {width}x{height}")
+    say(f"{quantity(len(loaded.train), 'training photo')} of {width}x{height}, {len(loaded.test)} held out")
     published = fit_folder(loaded, config, out, request, resume=resume)
     splat = published.folder / "splat.ply"
     if published.signal:
@@ -102,6 +104,8 @@ def demo(
         "kgs fit PHOTOS -o OUT  # three or more photos of your own",
         VIEWER.format(as_line(splat)),
     )
+    if open_page:
+        open_in_browser(out / "index.html")
     return 0
 
 

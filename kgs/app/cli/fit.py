@@ -12,18 +12,19 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 import tyro
 
-from kgs._support.errors import ArgumentError, DataError, printable
-from kgs.app.console import VIEWER, as_line, say, say_next
+from kgs._support.errors import ArgumentError, DataError, printable, quantity
+from kgs.app.console import VIEWER, as_line, is_terminal, open_in_browser, say, say_next
 from kgs.fit.config import COARSE, DETAILS, PRESETS, Background, FitConfig, min_side
 
 from .checks import SMALLEST, check_photos, check_photos_of, check_roll, check_side
-from .options import QUIET, IfGiven, On, Out, options_in
+from .options import QUIET, Flag, IfGiven, Open, Out
 from .tools import check_installed, load_tools
 from .unposed import find_scene, on_ctrl_c, open_scene
+from .words import options_in
 
 # The short help shows these entries of FitConfig, and all other options of the command but the rare ones.
 _OF_CONFIG = ("steps", "drop", "refine_poses", "seed", "device")
-_RARE = ("downscale", "lpips_weights", "mask_mode", "frames", "title", "live", "config")
+_RARE = ("downscale", "background", "lpips_weights", "mask_mode", "frames", "title", "live", "config")
 
 
 def first_config(words: list[str]) -> FitConfig:
@@ -59,12 +60,13 @@ def fit(
     mask_mode: Literal["ignore", "transparent"] = "ignore",
     preset: Literal["auto", "paper", "plain"] = "auto",
     detail: Literal["low", "normal", "high"] = "normal",
-    resume: bool = False,
+    resume: Flag = False,
     title: IfGiven[str] = None,
-    photos: On = True,
+    no_photos: Flag = False,
     roll: float = 0.0,
     lpips_weights: IfGiven[Path] = None,
-    live: bool = False,
+    live: Flag = False,
+    open_page: Open = False,
     config: Annotated[FitConfig, tyro.conf.arg(name="")],
 ) -> int:
     """Turn a folder of photos into a splat, a page to look at it, and a film.
@@ -96,10 +98,11 @@ def fit(
             win. See --detail high --help-all.
         resume: continue the unfinished fit in the folder of the results, or the finished one.
         title: of the page. Unless given: the name of the folder.
-        photos: --no-photos leaves the photos out of the page.
+        no_photos: leave the photos out of the page.
         roll: turn page and film clockwise by so many degrees.
         lpips_weights: folder with the weights of VGG16 and LPIPS (npz). Unless given: LPIPS is not measured.
         live: show the splat as it grows on a page on this machine, until the fit ends; a line says its address.
+        open_page: open the page in a browser when the fit is done.
         config: every number of the fit.
     """
     from kgs.app.files.locks import locked
@@ -160,7 +163,7 @@ def fit(
         hold_out=hold_out,
         background=background,
         points=config.init if config.init == "model-points" else "none",
-        photos=photos,
+        photos=not no_photos,
         roll=roll,
         title=title or "",
         masks="" if masks is None else os.path.abspath(masks),
@@ -168,7 +171,7 @@ def fit(
     )
     is_free = size is None and downscale is None  # the size follows from --detail
     say(f"device: {device_name(device)}")
-    stages = Stages(say, unposed)
+    stages = Stages(say if is_terminal() else lambda line: None, unposed)
     if is_free and (detail != "normal" or (unposed and device.type == "cpu")):
         size = DETAILS[detail].size
         if config.coarse is None:
@@ -197,7 +200,8 @@ def fit(
         if downscale is None:  # a size that is too small is refused before
             raise DataError(scene, "images", reason)
         raise ArgumentError(f"downscale: {reason}")
-    say(f"{printable(scene)}: {len(loaded.train)} training and {len(loaded.test)} test views of {width}x{height}")
+    kept = f"{quantity(len(loaded.train), 'training photo')} of {width}x{height}"
+    say(f"{printable(scene)}: {kept}, {len(loaded.test) or 'none'} held out")
     with on_ctrl_c("the cameras that were found are kept" if unposed else ""):
         published = fit_folder(loaded, config, out, request, resume=resume, lpips=lpips, live=live, stages=stages)
     metrics = published.fit.metrics
@@ -207,7 +211,7 @@ def fit(
     renders = out / "renders"
     say(f"{printable(splat)}: {metrics['gaussians']} Gaussians after {metrics['steps']} steps")
     if needless := left_out(published.fit.decisions):
-        say(f"left out: {needless}")
+        say(needless)
     if published.signal:
         say_next("the same command with --resume goes on where it stopped")
         return 128 + published.signal
@@ -221,6 +225,8 @@ def fit(
         f"{as_line('kgs', 'render', splat, '--cameras', posed, '-o', renders)}  # pictures from every camera",
         VIEWER.format(as_line(splat)),
     )
+    if open_page:
+        open_in_browser(out / "index.html")
     return 0
 
 

@@ -10,9 +10,10 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 from kgs._support.errors import DataError
 
 Value = TypeVar("Value")
-QUIET = tyro.conf.arg(help_behavior_hint="")  # the help leaves out "(default: None)", or True of a flag `--no-...`
+QUIET = tyro.conf.arg(help_behavior_hint="")  # the help leaves out "(default: None)" or False
 IfGiven = Annotated[Value | None, QUIET]
-On = Annotated[bool, QUIET]
+Flag = Annotated[bool, QUIET]
+Open = Annotated[bool, tyro.conf.arg(name="open", help_behavior_hint="")]
 
 EMPTY = Path()  # what "" on a command line becomes: this object. An equal one is the current folder.
 
@@ -20,7 +21,7 @@ EMPTY = Path()  # what "" on a command line becomes: this object. An equal one i
 def _read_input(words: list[str]) -> Path:
     path = _read_output(words)
     if path is not EMPTY and not path.exists():
-        raise DataError(path, "", "expected a file or folder that is there, found none")
+        raise DataError(path, "", "no such file or folder")
     return path
 
 
@@ -45,8 +46,3 @@ PATHS = ConstructorRegistry()  # every other path of a command is one that is re
 @PATHS.primitive_rule
 def _path(type_info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Path] | None:
     return _constructor(_read_input) if type_info.type is Path else None
-
-
-def options_in(words: list[str]) -> list[str]:
-    """The words among which there are options: those after a "--" are none."""
-    return words[: words.index("--")] if "--" in words else words

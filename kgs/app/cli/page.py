@@ -4,13 +4,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kgs._support.errors import ArgumentError, printable
-from kgs.app.console import as_line, say, say_next
+from kgs._support.errors import ArgumentError, printable, quantity
+from kgs.app.console import as_line, open_in_browser, say, say_next
 from kgs.fit.config import Backend, Background
 
 from .checks import check_file, check_photos_of, check_roll
 from .inputs import load_cameras, load_splat, options_of_fit
-from .options import IfGiven, On, Out
+from .options import Flag, IfGiven, Open, Out
 from .tools import load_tools
 
 if TYPE_CHECKING:
@@ -25,8 +25,9 @@ def page(
     out: Out = Path("index.html"),
     downscale: IfGiven[float] = None,
     background: Background = "black",
-    photos: On = True,
+    no_photos: Flag = False,
     roll: float = 0.0,
+    open_page: Open = False,
     device: str = "auto",
     backend: Backend = "auto",
 ) -> None:
@@ -43,9 +44,9 @@ def page(
         downscale: reduce the photos by this factor. Unless given: to the size of the fit, where the splat or the scene
             is in the folder of one.
         background: the colour behind the splat, and behind photos with transparency.
-        photos: --no-photos leaves out the photos beside their renders: the page is smaller, and can go where the photos
-            must not.
+        no_photos: leave out the photos beside their renders: the page is smaller, and can go where the photos must not.
         roll: turn all pictures clockwise by this angle in degrees, where photos lie on their side.
+        open_page: open the page in a browser when it is written.
         device: auto: a GPU if kgs has kernels for it, else the CPU. Or cpu, cuda, cuda:1, ...
         backend: auto: the fastest that is installed. kgs fit --help-all describes the others.
     """
@@ -85,17 +86,20 @@ def page(
             {"": fit},
             beside=pictured,
             words=("photo", "test"),
-            notes=["Whether the splat was fitted to these photos is not known here."],
-            photos=photos,
+            notes=["If the splat was fitted to these photos, their PSNR says little about other views."],
+            photos=not no_photos,
             roll=roll,
-            small=load_small(source, scene, background) if photos else None,
+            small=None if no_photos else load_small(source, scene, background),
         )
     level = fit.metrics["views"]["psnr"]
     measured = f", PSNR {level:.4g}" if level is not None else ""
-    say(f"{printable(out)}: {len(fit.model)} Gaussians, {len(scene.train)} photos of {width}x{height}{measured}")
+    photographs = f"{quantity(len(scene.train), 'photo')} of {width}x{height}"
+    say(f"{printable(out)}: {len(fit.model)} Gaussians, {photographs}{measured}")
     if cost:
         say(f"the page shows {cost}; {printable(ply)} has everything")
     say_next(f"open {as_line(out)} in a browser")
+    if open_page:
+        open_in_browser(out)
 
 
 def in_frame_of(scene: "Scene", again: "Scene") -> "Views":

@@ -20,11 +20,12 @@ from pathlib import Path
 from typing import Any
 
 from kgs._support.errors import ArgumentError, DataError, PhotosRefused, TrainingDiverged, printable
-from kgs.app.console import as_line, log_shown, say
+from kgs.app.console import as_line, log_shown, quiet, say
 from kgs.fit.config import FitConfig, Recipe
 
 from .interrupts import interrupt_as_usual
 from .tools import explain_import_error
+from .words import options_in, take_quiet
 
 COMMANDS = {
     "demo": "kgs.app.cli.demo:demo",
@@ -64,11 +65,12 @@ def exit_code(words: list[str]) -> int:
     warnings.showwarning = lambda text, *_: say(f"kgs: {text}", sys.stderr)
     flags: dict[str, str] = {}
     try:
+        words, is_quiet = take_quiet(words)
         name, words = _find(words)
         command = load_command(name)
         flags = _flags_of(command)
         call = _parse(command, name, words)
-        with log_shown():
+        with quiet(is_quiet), log_shown():
             return int(call() or 0)
     except SystemExit as stop:
         if not isinstance(stop.code, str):
@@ -126,6 +128,8 @@ def _find(words: list[str]) -> tuple[str, list[str]]:
         raise SystemExit(0)
     prefix = "bench " if words[:1] == ["bench"] else ""
     name, *rest = words[len(prefix.split()) :] or ["--help"]
+    if name == "help" and rest:
+        return _find([*prefix.split(), *rest, "--help"])
     if name in _HELP:
         _say_commands(prefix)
         raise SystemExit(0)
@@ -152,7 +156,9 @@ def _say_commands(prefix: str) -> None:
         if name.startswith(prefix):
             summary = str(load_command(name).__doc__).partition("\n")[0]
             lines.append(f"  {name.removeprefix(prefix):<16} {summary}")
-    say("\n".join([*lines, "", f"kgs {prefix}COMMAND --help lists the options and gives examples."]))
+    lines += ["", f"kgs {prefix}COMMAND --help lists the options and gives examples."]
+    lines += ["-q, with any command: only errors and warnings are printed. kgs -V prints versions."]
+    say("\n".join(lines))
 
 
 def load_command(name: str) -> Callable[..., Any]:
@@ -195,7 +201,7 @@ def _parse(command: Callable[..., Any], name: str, words: list[str]) -> partial[
     """Read the options, or say what they are; returns the call that they ask for."""
     import tyro
 
-    from .options import EMPTY, PATHS, options_in
+    from .options import EMPTY, PATHS
 
     _check_out(command, name, words)
     prog = f"kgs {name}"
@@ -220,7 +226,7 @@ def _parse(command: Callable[..., Any], name: str, words: list[str]) -> partial[
             try:
                 tyro.cli(short_help(config), prog=prog, args=["--help"], config=plain)
             finally:
-                say(f"{prog} --help-all shows all options")
+                say(f"{prog} --help-all shows all options. -q: only errors and warnings are printed.")
         function = partial(bind, config=config)
     with PATHS:
         return tyro.cli(

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import PurePosixPath, PureWindowsPath
 from typing import Any
 
+from kgs._support.errors import quantity
 from kgs.app.files.plot import PARTS, Runs, with_run
 
 # Titles and digits of the measures, by their keys in metrics.json.
@@ -56,32 +57,31 @@ def facts(values: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
 
 
 def verdict(runs: Runs) -> str:
-    """How good the fit is in one or two sentences: by the PSNR of the held-out views, else by that of training views.
+    """How good the fit is in a few sentences: by the PSNR of the held-out views, else by that of training views.
 
-    What a PSNR means in words is that of the last run with one, of photos that it was not trained on; see docs/page.md
-    for the limits of such words.
+    Words follow the PSNR of held-out photos alone, that of the last run with one; see docs/page.md for their limits.
     """
     part = next((part for part in PARTS if any(metrics.get(part) for metrics in runs.values())), None)
     if part is None:
         return ""
     measured = {run: metrics[part] for run, metrics in runs.items() if metrics.get(part)}
     levels = {run: values["psnr"] for run, values in measured.items() if values.get("psnr") is not None}
-    count = len(next(iter(measured.values()))["views"])
-    photos = "photo" if count == 1 else "photos"
+    photos = quantity(len(next(iter(measured.values()))["views"]), "photo")
     which = {
-        "test": f"{count} {photos} held out of the training",
-        "train": f"the {count} {photos} it was trained on",
-        "views": f"{count} {photos}",
+        "test": f"{photos} held out of the training",
+        "train": f"the {photos} it was trained on",
+        "views": photos,
     }[part]
     text = f"PSNR on {which}: not measured."
     if levels:
         numbers = ", ".join(with_run(f"{level:.1f} dB", run).replace(", ", " ") for run, level in levels.items())
-        words = "" if part == "train" else f", that is {_in_words(list(levels.values())[-1])}"
+        words = f", that is {_in_words(list(levels.values())[-1])}" if part == "test" else ""
         text = f"PSNR on {which}: {numbers}{words}."
     if part != "train":
         return text
     unknown = "No photo was held out, so how good new views are was not measured"
-    return f"{unknown} (kgs fit with --hold-out 8 measures it). {text}"
+    little = " That says little: it was made to show them." if levels else ""
+    return f"{unknown} (kgs fit with --hold-out 8 measures it). {text}{little}"
 
 
 def _in_words(psnr: float) -> str:

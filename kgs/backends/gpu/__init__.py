@@ -1,9 +1,9 @@
 """The backend of Triton kernels, for float32 on GPUs.
 
-`projection_kernels`, `compositing_kernels` and `loss_kernels` have the kernels of a stage, and `projection`,
-`compositing` and `loss` bring them to torch; the other files of kernels are parts of these. `launch` calls them,
-`compiling` compiles them ahead, `verdict` keeps that they passed :func:`self_check`, and `entry_counts` tells
-compositing what projection has counted. Torch defines what is right; a kernel gives the same
+`projection_kernels`, `compositing_kernels`, `loss_kernels` and `optimizer_kernels` have the kernels of a stage, and
+`projection`, `compositing`, `loss` and `optimizer` bring them to torch; the other files of kernels are parts of these.
+`launch` calls them, `compiling` compiles them ahead, `verdict` keeps that they passed :func:`self_check`, and
+`entry_counts` tells compositing what projection has counted. Torch defines what is right; a kernel gives the same
 within the rounding of float32, and its formulas are explained in the torch code that it follows. `import kgs` does not
 import triton: a stage is imported when it is first used.
 
@@ -29,11 +29,11 @@ from contextlib import suppress
 import torch
 
 from kgs._support.errors import warn
-from kgs.backends.base import Backend, CompositingCall, Compositor, LossStage, ProjectionStage
+from kgs.backends.base import Backend, CompositingCall, Compositor, LossStage, OptimizerStages, ProjectionStage
 
 
 class GpuBackend(Backend):
-    """Kernels for pinhole cameras, tiles of 8 x 8 pixels and the loss; other cameras go to torch, inside the call."""
+    """Kernels for pinhole cameras, tiles of 8 x 8 pixels, loss and optimizer; other cameras go to torch, inside."""
 
     name = "triton"
     devices = ("cuda", "xpu")  # "cuda" are AMD's, too
@@ -41,6 +41,7 @@ class GpuBackend(Backend):
     tile_size = 8  # a constant of the kernels
     package = ("triton", "torch brings it on Linux; on Windows: pip install triton-windows")
     has_loss = True
+    has_optimizer = True
 
     def runs_on(self, device: torch.device) -> bool:
         """On GPUs, and on CPUs in Triton's interpreter."""
@@ -90,6 +91,13 @@ class GpuBackend(Backend):
         from .loss import loss_and_gradient
 
         return loss_and_gradient
+
+    @property
+    def optimizer(self) -> OptimizerStages:
+        """See `Backend.optimizer`."""
+        from .optimizer import GpuOptimizer
+
+        return GpuOptimizer()
 
 
 def _is_interpreted() -> bool:
