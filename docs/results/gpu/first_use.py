@@ -1,7 +1,8 @@
 """How long kernels take to compile that a first use needs, without a GPU: `python first_use.py`.
 
 Those of the self-check and of training steps, for compute capability 9.0, each time in a new process with an empty
-cache, in turn one after another and side by side. Prints seconds and, of each, processor time.
+cache, in turn one after another and side by side in two threads. Prints seconds, processor time, and how many threads
+ran or waited for a core on average, as Linux counts it: how many would have run on a machine with nothing else to do.
 """
 
 import argparse
@@ -11,7 +12,10 @@ import resource
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -19,26 +23,36 @@ WAYS = ("one after another", "side by side")
 
 
 def measure(way: str) -> None:
-    """Compile in one of the ways; print how many kernels, seconds and processor time as JSON."""
+    """Compile in one of the ways; print how many kernels, seconds, processor time and threads as JSON."""
     import triton
     from host_time import Driver
 
     from kgs.backends.agreement import FITS, _run
-    from kgs.backends.gpu import GpuBackend
+    from kgs.backends.gpu import GpuBackend, compiling
     from kgs.backends.gpu.compiling import compile_together, needed_launches
 
     cpu = torch.device("cpu")
     triton.runtime.driver.set_active(Driver())
     launches = needed_launches(lambda: _run(GpuBackend(), cpu, FITS))
+    os.cpu_count = lambda: 1 + WAYS.index(way)
+    active: dict[int, list[float]] = {}
+    compile_one = compiling._compile
+
+    def counted(*arguments: Any) -> None:
+        compile_one(*arguments)
+        thread = threading.get_native_id()
+        numbers = Path(f"/proc/self/task/{thread}/schedstat").read_text().split()
+        active[thread] = [int(x) / 1e9 for x in numbers[:2]]
+
+    compiling._compile = counted
     start = time.perf_counter()
-    if way == WAYS[0]:
-        for launch in launches:
-            launch.kernel.warmup(*launch.arguments, grid=launch.grid, **launch.options)
-    else:
-        compile_together(launches, cpu)
+    compile_together(launches, cpu)
     seconds = time.perf_counter() - start
-    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    print(json.dumps([len(launches), seconds, sum(x.ru_utime + x.ru_stime for x in used)]))
+    assembler = resource.getrusage(resource.RUSAGE_CHILDREN)
+    children = assembler.ru_utime + assembler.ru_stime
+    used = sum(ran for ran, _ in active.values()) + children
+    waited = sum(waiting for _, waiting in active.values())
+    print(json.dumps([len(launches), seconds, used, (used + waited) / seconds]))
 
 
 def main() -> None:
@@ -57,8 +71,8 @@ def main() -> None:
                 environment = os.environ | {"TRITON_CACHE_DIR": folder}
                 done = subprocess.run(command, env=environment, capture_output=True, text=True)
                 assert done.returncode == 0, done.stderr
-                count, seconds, used = json.loads(done.stdout.splitlines()[-1])
-                print(f"{way}: {count} kernels, {seconds:.1f} s, {used:.1f} s of processor time")
+                count, seconds, used, active = json.loads(done.stdout.splitlines()[-1])
+                print(f"{way}: {count} kernels, {seconds:.1f} s, {used:.1f} s of processor time, {active:.2f} threads")
 
 
 if __name__ == "__main__":
