@@ -76,11 +76,11 @@ class _NothingComputed(TorchFunctionMode):
         found = func(*args, **(kwargs or {}))
         if func in _EMPTY:
             return found.zero_()
-        return _at_least_one(found) if func in _READS else found
+        return _without_zeros(found) if func in _READS else found
 
 
-def _at_least_one(value: Any) -> Any:
+def _without_zeros(value: Any) -> Any:
     """A number or a nested list of numbers, with 1 for each whole number 0."""
     if isinstance(value, list):
-        return [_at_least_one(x) for x in value]
+        return [_without_zeros(x) for x in value]
     return max(value, 1) if type(value) is int else value
