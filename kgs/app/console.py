@@ -1,5 +1,6 @@
 """Lines and progress bars on the console. A closed pipe never aborts a fit."""
 
+import logging
 import os
 import shlex
 import sys
@@ -69,6 +70,27 @@ def open_in_browser(page: Path) -> None:
     """Open a page in the user's browser; a line says so where there is none."""
     if not webbrowser.open(page.resolve().as_uri()):
         say(f"kgs: no browser was found: open {printable(page)} yourself", sys.stderr)
+
+
+@contextmanager
+def log_shown() -> Iterator[None]:
+    """Print what the library's log says of its progress, a line each, on stderr."""
+    log = logging.getLogger("kgs")
+    level = log.level
+    handler = _Lines()
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(level)
+
+
+class _Lines(logging.Handler):
+    def emit(self, record: logging.LogRecord) -> None:
+        if not _is_quiet:
+            say(f"kgs: {record.getMessage()}", sys.stderr)
 
 
 def as_line(*words: object) -> str:
