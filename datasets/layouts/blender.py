@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 
+from kgs._support.errors import quantity
 from kgs.datasets.frames import Frame, FrameSet, PointCloud
 from kgs.datasets.splits import BLENDER_TRAIN_FRAMES
 
@@ -39,5 +40,5 @@ def _test_frames(root: Path) -> tuple[list[Frame] | None, tuple[str, ...]]:
     present = [frame for frame in frames if frame.path.is_file()]
     if len(present) < len(frames):
         gone = len(frames) - len(present)
-        notes += (f"{_TEST_FILE}: {gone} of {len(frames)} poses have no picture and are left out",)
+        notes += (f"{_TEST_FILE}: left out, without a picture: {gone} of {quantity(len(frames), 'pose')}",)
     return present or None, notes

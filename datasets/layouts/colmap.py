@@ -48,7 +48,7 @@ def load_colmap(root: Path, photo_folder: str = "") -> FrameSet:
         ids[path] = image_id
     gone = [frame.name for frame in frames if not frame.path.is_file()]
     if 0 < len(gone) <= len(frames) / 2:
-        notes += (f"{len(gone)} of {len(frames)} photos are gone and left out: {listed(gone, _LISTED)}",)
+        notes += (f"left out, because the file is gone: {len(gone)} of {len(frames)} photos ({listed(gone, _LISTED)})",)
         frames = [frame for frame in frames if frame.path.is_file()]
     return FrameSet(frames, model_points=lambda t: track_points(folder, {ids[f.path] for f in t}), notes=notes)
 

@@ -14,7 +14,7 @@ import kornia.geometry as kg
 import torch
 from torch import Tensor
 
-from kgs._support.errors import DataError
+from kgs._support.errors import DataError, quantity
 from kgs._support.json_files import is_number, read_json
 from kgs.datasets.folders import IMAGE_SUFFIXES
 from kgs.datasets.frames import Frame, FrameSet, find_file, path_inside
@@ -69,7 +69,7 @@ def load_nerfstudio(root: Path) -> FrameSet:
     if not train or (lists["train"] and not held_out):
         raise DataError(root / "transforms.json", "train_filenames", "expected views to train on and others to test on")
     if (unused := len(frames) - len(train) - len(held_out)) > 0:
-        notes += (f"transforms.json: {unused} frames are neither training nor test views",)
+        notes += (f"transforms.json: neither training nor test views: {quantity(unused, 'frame')}",)
     return FrameSet(train, held_out or None, notes=notes)
 
 

@@ -1,5 +1,6 @@
 """Lines and progress bars on the console. A closed pipe never aborts a fit."""
 
+import logging
 import os
 import shlex
 import sys
@@ -52,6 +53,12 @@ def say_next(first: str, *others: str) -> None:
     say("\n  ".join(["next:", first, *others]) if others and is_terminal() else f"next: {first}")
 
 
+def say_on_terminal(line: str) -> None:
+    """As :func:`say`, but only to somebody who waits for what comes next."""
+    if is_terminal():
+        say(line)
+
+
 def is_terminal() -> bool:
     """Whether somebody reads stdout as it is written."""
     with suppress(OSError, ValueError, AttributeError):  # closed, or None
@@ -63,6 +70,27 @@ def open_in_browser(page: Path) -> None:
     """Open a page in the user's browser; a line says so where there is none."""
     if not webbrowser.open(page.resolve().as_uri()):
         say(f"kgs: no browser was found: open {printable(page)} yourself", sys.stderr)
+
+
+@contextmanager
+def log_shown() -> Iterator[None]:
+    """Print what the library's log says of its progress, a line each, on stderr."""
+    log = logging.getLogger("kgs")
+    level = log.level
+    handler = _Lines()
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(level)
+
+
+class _Lines(logging.Handler):
+    def emit(self, record: logging.LogRecord) -> None:
+        if not _is_quiet:
+            say(f"kgs: {record.getMessage()}", sys.stderr)
 
 
 def as_line(*words: object) -> str:
@@ -131,7 +159,7 @@ def progress(total: int, title: str, done: int = 0, unit: str = "step") -> Itera
         seconds = time.monotonic() - begin
         if units == 1:
             first = seconds
-        if seconds >= due and units > 1:
+        if seconds >= due and units > 1 and done < total:
             due = 2 * seconds
             left = (seconds - first) / (units - 1) * (total - done)
             parts = [f"{title}: {done} of {total} {unit}s"]

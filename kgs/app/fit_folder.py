@@ -65,6 +65,7 @@ def fit_folder(
     *,
     resume: bool = False,
     lpips: Lpips | None = None,
+    held_out: dict[str, Any] | None = None,
     live: bool = False,
     say: Callable[[str], None] = say,
     stages: Stages | None = None,
@@ -82,6 +83,7 @@ def fit_folder(
         request: how the scene was loaded, for config.json, and how the page shows it.
         resume: continue the fit in `out/unfinished`, or if there is none that in `out`.
         lpips: the perceptual metric, or None to leave it out.
+        held_out: the measures of :func:`kgs.app.held_out.measure_held_out`, for metrics.json and the page.
         live: show the splat during the fit on a page on this machine, see :class:`kgs.app.live.LivePage`.
         say: called with each line for the user.
         stages: names the stages as they begin.
@@ -122,7 +124,7 @@ def fit_folder(
             is_trained = True
             with replacing(work, "fit", keep_on_error=True) as new:
                 stages.begin("film")
-                fit = _write_results(fit, new, names, request, lpips)
+                fit = _write_results(fit, new, names, request, lpips, held_out)
                 for note in fit.notes:
                     trainer.state.note(note)
                 stages.begin("page")
@@ -240,7 +242,14 @@ def _settings(trainer: Trainer, request: SceneRequest) -> dict[str, Any]:
     }
 
 
-def _write_results(fit: Fit, folder: Path, names: dict[str, str], request: SceneRequest, lpips: Lpips | None) -> Fit:
+def _write_results(
+    fit: Fit,
+    folder: Path,
+    names: dict[str, str],
+    request: SceneRequest,
+    lpips: Lpips | None,
+    held_out: dict[str, Any] | None,
+) -> Fit:
     """Write all files but the page; returns the fit with its metrics."""
     scene = fit.scene
     save_ply(folder / "splat.ply", fit.model, offset=scene.offset)
@@ -250,7 +259,7 @@ def _write_results(fit: Fit, folder: Path, names: dict[str, str], request: Scene
     for i, name in each(list(enumerate(scene.test.names)), "test pictures", "view"):
         picture = scene.test.as_photo(i, fit.test_renders[i].image[0])
         write_png(folder / _TEST / names[name], as_taken(picture, scene.test, i))
-    metrics = measure(fit, lpips)
+    metrics = measure(fit, lpips) | ({"held_out": held_out} if held_out else {})
     write_json(folder / "metrics.json", metrics)
     return fit.annotated(metrics=metrics, notes=(*fit.notes, *notes))
 

@@ -1,5 +1,7 @@
 """How far a backend is from torch on a small scene: whether "auto" trusts it, and what `kgs check` shows."""
 
+from dataclasses import dataclass, replace
+
 import torch
 from kornia.filters import gaussian_blur2d, get_gaussian_kernel1d
 from kornia.losses import ssim_loss
@@ -13,36 +15,74 @@ from .torch import TorchBackend
 
 BOUND = 5e-5  # a larger disagreement is no rounding
 _WINDOW, _SIGMA, _WEIGHT = 11, 1.5, 0.2  # of the loss
-_RATE, _STEP, _BETAS, _EPS = 0.01, 3.0, (0.9, 0.999), 1e-8  # of Adam
-_SCALE, _FACTOR = (25.0, 15.0), 0.9  # of gradients, of opacities
+_BETAS, _ADAM_EPS, _LR, _STEPS = (0.9, 0.999), 1e-15, 0.01, 3.0  # of Adam
 # thresholds: a layer that counts for one backend alone must not matter
 _OPTIONS = RasterOptions(tile_size=8, alpha_threshold=1e-6, transmittance_stop=1e-5)
 
 
+@dataclass(frozen=True)
+class Step:
+    """What a training step asks of a backend.
+
+    Args:
+        cameras: how many see the Gaussians.
+        bands: of the harmonics, `(degree + 1)^2`.
+        depths: whether depths and their squares are composited, too.
+        absgrad: whether absolute values of gradients are summed, too.
+        poses: whether poses and intrinsics have gradients.
+    """
+
+    cameras: int = 1
+    bands: int = 16
+    depths: bool = False
+    absgrad: bool = False
+    poses: bool = False
+
+
+EVERYTHING = Step(cameras=2, depths=True, poses=True)
+FITS = (Step(absgrad=True), Step(bands=1), Step(bands=1, poses=True))  # of fits, as they begin and as they end
+
+
 @torch.inference_mode(False)
 @torch.enable_grad()
-def disagreement(backend: Backend, device: torch.device) -> float:
+def disagreement(backend: Backend, device: torch.device, steps: tuple[Step, ...] = (EVERYTHING,)) -> float:
     """The largest difference from torch in float64, over the largest value of its kind.
 
-    Of a training step of 32 Gaussians before two cameras: harmonics of degree 3, a stack of opaque Gaussians, five
-    features, a background, the loss; the gradients of all Gaussians, of poses and intrinsics, and of the image. And of
-    activations, and of what an optimizer does with gradients.
+    Of training steps of 32 Gaussians, among them an opaque stack: activations, images, a background, the loss, and all
+    gradients that are asked for.
 
     Args:
         backend: works in float32 on the device.
         device: where; torch is on the CPU where it has no float64 there.
+        steps: what is done.
     """
+    backend.compile_ahead(lambda of_cpu: _run(backend, of_cpu, steps), device)
     reference_device = device if device.type in ("cpu", "cuda") else torch.device("cpu")
-    found, expected = (
-        [*_activate(one, where), *_render(one, where), *_blend(one, where)]
-        for one, where in ((backend, device), (TorchBackend(), reference_device))
-    )
-    pairs = list(zip(found, expected, strict=True))
+    found = _run(backend, device, steps)
+    exact = _by_stages(TorchBackend(), reference_device, steps)
     if backend.has_loss:
-        pairs += zip(_loss(backend, device), _exact_loss(), strict=True)
+        exact += _exact_loss()
     if backend.has_optimizer:
-        pairs += zip(_optimized(backend, device), _exactly_optimized(), strict=True)
-    return max(_relative(value, expected) for value, expected in pairs)
+        exact += _exactly_optimized()
+    return max(_relative(value, expected) for value, expected in zip(found, exact, strict=True))
+
+
+def _run(backend: Backend, device: torch.device, steps: tuple[Step, ...]) -> list[Tensor]:
+    """What a backend finds."""
+    found = _by_stages(backend, device, steps)
+    if backend.has_loss:
+        found += _loss(backend, device)
+    if backend.has_optimizer:
+        found += _optimized(backend, device)
+    return found
+
+
+def _by_stages(backend: Backend, device: torch.device, steps: tuple[Step, ...]) -> list[Tensor]:
+    """What the stages find that torch has, too; float64 from torch, else float32."""
+    found = _blend(backend, device)
+    for step in steps:
+        found += [*_activate(backend, device, step), *_render(backend, device, step)]
+    return found
 
 
 def _random(*shape: int, low: float = -1.0, high: float = 1.0, seed: int = 0) -> Tensor:
@@ -57,14 +97,15 @@ def _dtype(backend: Backend) -> torch.dtype:
     return torch.float64 if isinstance(backend, TorchBackend) else torch.float32
 
 
-def _activate(backend: Backend, device: torch.device) -> list[Tensor]:
+def _activate(backend: Backend, device: torch.device, step: Step) -> list[Tensor]:
     """Scales, opacities and harmonics, and the gradients of what they are made of."""
     values = (_random(8, 3, low=-8.0), _random(8, low=-8.0, high=8.0), _random(8, 1, 3), _random(8, 15, 3, seed=1))
     leaves = [x.to(device, _dtype(backend)).requires_grad_() for x in values]
     log_scales, opacity_logits, sh_dc, sh_rest = leaves
-    activated = backend.activate(log_scales, opacity_logits, sh_dc, sh_rest, 9)
+    activated = backend.activate(log_scales, opacity_logits, sh_dc, sh_rest, step.bands)
     weights = [_random(*x.shape, seed=2).to(x) for x in activated]
-    return [*activated, *torch.autograd.grad(activated, leaves, weights)]
+    varying = leaves if step.bands > 1 else leaves[:3]
+    return [*activated, *torch.autograd.grad(activated, varying, weights)]
 
 
 def _blend(backend: Backend, device: torch.device) -> list[Tensor]:
@@ -76,8 +117,8 @@ def _blend(backend: Backend, device: torch.device) -> list[Tensor]:
     return [blended, *torch.autograd.grad(blended, leaves, _random(2, 5, 6, 7, seed=2).to(blended))]
 
 
-def _render(backend: Backend, device: torch.device) -> list[Tensor]:
-    """Image, depth and transmittance, and the gradients of all inputs."""
+def _render(backend: Backend, device: torch.device, step: Step) -> list[Tensor]:
+    """Images, once with what gradients need and once without, and gradients."""
     dtype = _dtype(backend)
     n = 32
     width, height = 16, 12
@@ -88,22 +129,29 @@ def _render(backend: Backend, device: torch.device) -> list[Tensor]:
     means[:8] = torch.tensor([0.3, -0.2, 2.5], device="cpu") * torch.linspace(1.0, 1.4, 8, device="cpu")[:, None]
     scales[:8] = 0.15
     opacities[:8] = 5.0
+    values = (means, _random(n, 4, seed=3), scales, opacities, _random(n, 16, 3, seed=4)[:, : step.bands])
     poses = torch.eye(4, device="cpu").repeat(2, 1, 1)
     poses[1, 0, 3] = 0.2
-    values = (means, _random(n, 4, seed=3), scales, opacities, _random(n, 16, 3, seed=4), poses)
     focal = torch.tensor([[15.0, 0.0, 7.5], [0.0, 15.0, 5.5], [0.0, 0.0, 1.0]], device="cpu").repeat(2, 1, 1)
-    leaves = [x.to(device, dtype).requires_grad_() for x in (*values, focal)]
-    camera = pinhole_cameras(leaves[5], leaves[6], width, height)
-    projected = backend.project(Gaussians(*leaves[:5]), camera, image_size(camera), _OPTIONS, True)
-    depths = projected.depths[:, None]
-    features = torch.cat([projected.colors, depths, depths.square()], 1)
+    leaves = [x.to(device, dtype).requires_grad_() for x in values]
+    extrinsics, intrinsics = (x[: step.cameras].to(device, dtype).requires_grad_(step.poses) for x in (poses, focal))
+    camera = pinhole_cameras(extrinsics, intrinsics, width, height)
+    varying = [*leaves, extrinsics, intrinsics] if step.poses else leaves
+    options = replace(_OPTIONS, absgrad=step.absgrad)
+    projected = backend.project(Gaussians(*leaves), camera, image_size(camera), options, True)
+    features = projected.colors
+    if step.depths:
+        depths = projected.depths[:, None]
+        features = torch.cat([features, depths, depths.square()], 1)
     inputs = CompositingInputs(projected.means2d, projected.factors, projected.opacities, features)
     with torch.no_grad():
-        compositor = backend.compositor(CompositingCall(projected, features, _OPTIONS))
+        compositor = backend.compositor(CompositingCall(projected, features, options))
         (sums, transmittance, _), kept = compositor.forward(inputs, True)
         by_sums, by_transmittance = (_random(*x.shape, seed=5).to(device, dtype) for x in (sums, transmittance))
-        gradients, _ = compositor.backward(inputs, kept, by_sums, by_transmittance, (True,) * 4)
-    return [sums, transmittance, *torch.autograd.grad(inputs, leaves, gradients)]
+        gradients, absolute = compositor.backward(inputs, kept, by_sums, by_transmittance, (True,) * 4)
+        (drawn, behind, _), _ = compositor.forward(inputs, False)
+    images = [sums, transmittance, drawn, behind, *([] if absolute is None else [absolute])]
+    return images + list(torch.autograd.grad(inputs, varying, gradients))
 
 
 def _pictures() -> tuple[Tensor, Tensor]:
@@ -130,35 +178,40 @@ def _exact_loss() -> tuple[Tensor, Tensor]:
     return loss, torch.autograd.grad(loss, image)[0]
 
 
-def _before() -> tuple[Tensor, ...]:
-    """Parameters, gradients, both moments, sums of norms, logits."""
-    return _random(40), _random(40, seed=1), _random(40, seed=2), _random(40, low=0.0, seed=3), _random(20), _random(20)
+def _parameters() -> list[Tensor]:
+    """A parameter, its gradient, and its moments."""
+    gradient, average, square = (_random(40, 3, seed=seed) for seed in (9, 10, 11))
+    return [_random(40, 3, seed=8), gradient, average, square.abs()]
 
 
 def _optimized(backend: Backend, device: torch.device) -> list[Tensor]:
-    """What the stages of an optimizer change: parameters and moments, sums and counts, logits."""
-    *update, sums, logits = (x.to(device, torch.float32) for x in _before())
-    parameter, gradient, exp_avg, exp_avg_sq = update
-    counts = torch.zeros(20, dtype=torch.int64, device=device)
-    ids = torch.arange(19, -1, -1, device=device)
-    stages = backend.optimizer
-    stages.adam([AdamUpdate(parameter, gradient, exp_avg, exp_avg_sq, _RATE, _STEP)], _BETAS, _EPS)
-    stages.add_gradient_norms(sums, counts, ids, gradient.view(20, 2), _SCALE)
-    stages.decay_opacity(logits, _FACTOR)
-    return [parameter, exp_avg, exp_avg_sq, sums, counts, logits]
+    """What is left of a step of Adam for six parameters, of statistics of densification, and of a decay of logits."""
+    updates = []
+    for _ in range(6):
+        parameter, gradient, average, square = (x.to(device, torch.float32) for x in _parameters())
+        updates.append(AdamUpdate(parameter, gradient, average, square, _LR, _STEPS))
+    backend.optimizer.adam(updates, _BETAS, _ADAM_EPS)
+    logits = _parameters()[-1][:, 0].to(device, torch.float32).contiguous()
+    sums, counts = logits.clone(), torch.zeros(40, dtype=torch.int64, device=device)
+    ids = torch.arange(0, 40, 2, device=device)
+    backend.optimizer.add_gradient_norms(sums, counts, ids, gradient[:20, :2].contiguous(), (0.5, 2.0))
+    backend.optimizer.decay_opacity(logits, 0.9)
+    return [updates[-1].parameter, updates[0].exp_avg, updates[0].exp_avg_sq, sums, counts, logits]
 
 
 def _exactly_optimized() -> list[Tensor]:
-    """The same by the formulas."""
-    parameter, gradient, exp_avg, exp_avg_sq, sums, logits = _before()
-    (beta1, beta2), (x, y) = _BETAS, torch.tensor(_SCALE, device="cpu")
-    exp_avg = beta1 * exp_avg + (1 - beta1) * gradient
-    exp_avg_sq = beta2 * exp_avg_sq + (1 - beta2) * gradient.square()
-    root = (exp_avg_sq / (1 - beta2**_STEP)).sqrt() + _EPS
-    parameter = parameter - _RATE * exp_avg / (1 - beta1**_STEP) / root
-    norms = torch.hypot(gradient[::2] * x, gradient[1::2] * y).flip(0)
-    decayed = (_FACTOR * logits.sigmoid()).logit()
-    return [parameter, exp_avg, exp_avg_sq, sums + norms, torch.ones_like(sums), decayed]
+    """The same by its formulas."""
+    parameter, gradient, average, square = _parameters()
+    beta1, beta2 = _BETAS
+    logits = square[:, 0]
+    norms, counts = torch.zeros_like(logits), torch.zeros_like(logits)
+    norms[::2] = (gradient[:20, :2] * torch.tensor([0.5, 2.0], device="cpu")).norm(dim=1)
+    counts[::2] = 1.0
+    average = beta1 * average + (1.0 - beta1) * gradient
+    square = beta2 * square + (1.0 - beta2) * gradient.square()
+    root = (square / (1.0 - beta2**_STEPS)).sqrt() + _ADAM_EPS
+    parameter = parameter - _LR / (1.0 - beta1**_STEPS) * average / root
+    return [parameter, average, square, logits + norms, counts, (0.9 * logits.sigmoid()).logit()]
 
 
 def _relative(value: Tensor, expected: Tensor) -> float:

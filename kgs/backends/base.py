@@ -3,6 +3,7 @@
 import functools
 import importlib.util
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -217,6 +218,15 @@ class Backend(ABC):
     def is_trusted(self, device: torch.device) -> bool:
         """Whether "auto" may take it on this device. The first call may take seconds, and say in a line why not."""
         return True
+
+    def compile_ahead(self, run: Callable[[torch.device], object], device: torch.device) -> None:
+        """Compile what a piece of code needs on a device, all at once, where the backend can; reports no error.
+
+        Args:
+            run: calls stages of this backend, with tensors of the device that it is given.
+            device: where it will run.
+        """
+        return
 
     def covers(self, like: Tensor) -> bool:
         """Whether it works on tensors of this dtype and device, while no graph is traced; cheap, reads no values."""

@@ -95,7 +95,7 @@ def left_out(decisions: Decisions) -> str:
     parts = []
     degree = decisions.sh_degree
     if degree is not None and degree.chosen == 0:
-        why = degree.why if degree.gain is None else f"harmonics could gain {degree.gain:.2f} dB"
+        why = degree.why if degree.gain is None else f"harmonics could add at most {degree.gain:.2f} dB"
         parts.append(f"each colour is the same from all directions: {why or 'by rule'}")
     overlap = decisions.overlap
     if overlap is not None and overlap.drop == 0:

@@ -179,6 +179,10 @@ def as_text(metrics: dict[str, Any]) -> str:
     """The metrics of a fit as lines of text."""
     lines = list[str]()
     names = {"psnr": "PSNR", "ssim": "SSIM", "ssim_zero_padded": "SSIM (zero padded)", "lpips_vgg": "LPIPS"}
+    if held_out := metrics.get("held_out"):
+        measured = [f"{title} {held_out[key]:.4g}" for key, title in names.items() if held_out.get(key) is not None]
+        names_of = ", ".join(view["name"] for view in held_out["views"])
+        lines.append(f"a fit without {names_of} shows it with {', '.join(measured)}")
     for part in ("test", "color_corrected", "train"):
         values = metrics.get(part) or {}
         measured = [f"{title} {values[key]:.4g}" for key, title in names.items() if values.get(key) is not None]
@@ -193,9 +197,9 @@ def as_text(metrics: dict[str, Any]) -> str:
     if level is not None and rest is not None:
         percent = 100 * coverage["share"]
         lines.append(f" test: {percent:.0f} % is in two training views, PSNR {level:.4g}; the rest {rest:.4g}")
-    if not metrics["test"]:
+    if not metrics["test"] and not held_out:
         lines.append(
-            "no photo was held out: how good other views are was not measured (--hold-out). "
+            "no photo was held out: how good other views are was not measured (see --measure and --hold-out). "
             "Every fit comes close to its own photos."
         )
     return "\n".join(lines)

@@ -1,7 +1,7 @@
 """`--device` of the commands: what auto takes, what is said of it, and what a resumed fit goes on with."""
 
 import inspect
-import time
+import logging
 
 import pytest
 import torch
@@ -31,13 +31,11 @@ def card(monkeypatch):
     class Triton(backends.TorchBackend):
         name, devices, package = "triton", ("cuda",), ("triton", "torch brings it")
         is_there = is_right = True
-        seconds = 0.0
 
         def is_installed(self):
             return self.is_there
 
         def is_trusted(self, device):
-            time.sleep(self.seconds)
             return self.is_right
 
     numba, triton = Numba(), Triton()
@@ -85,13 +83,17 @@ def test_auto_is_the_cpu_without_a_gpu_and_with_one_that_cannot_be_used(card, mo
         tools.load_tools("auto", "triton")
 
 
-def test_a_line_says_why_the_first_use_of_a_gpu_takes_long(card, monkeypatch, capsys):
-    monkeypatch.setattr(tools, "_SILENCE", 0.05)
+def test_a_line_of_a_command_says_why_the_first_use_of_a_gpu_takes_long(card, monkeypatch, capsys):
+    log = logging.getLogger("kgs")
+    before = log.level, list(log.handlers)
+    monkeypatch.setattr(card[1], "is_trusted", lambda _: log.info("compiling: %d of %d", 12, 27) or True)
     tools.load_tools("auto")
-    assert not capsys.readouterr().out
-    card[1].seconds = 0.3
-    tools.load_tools("cuda")
-    assert capsys.readouterr().out.startswith("the kernels for the GPU are checked; the first time")
+    assert capsys.readouterr() == ("", "")  # of the library
+    monkeypatch.setitem(COMMANDS, "check", lambda: tools.load_tools("cuda") and 0)
+    monkeypatch.setattr("kgs.app.cli.run.load_command", COMMANDS.get)
+    assert run("check") == 0
+    assert capsys.readouterr() == ("", "kgs: compiling: 12 of 27\n")
+    assert (log.level, log.handlers) == before
 
 
 def test_auto_is_the_default_of_all_commands():

@@ -131,7 +131,10 @@ def splats(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         ("scale {fit} --by 1,2,3 4,5,6 0 -o {out}", "--by: "),
         ("scale {fit} --by 1,2,3 4,5,6 -2 -o {out}", "--by: "),
         ("scale {fit} --by 1,2,3 4,5,6 inf -o {out}", "--by: "),
-        ("nonsense", "one of demo, fit, render, eval, page, clean, scale, export, check, bench, study, got 'nonsense'"),
+        (
+            "nonsense",
+            "one of demo, fit, poses, render, eval, page, clean, scale, export, check, bench, study, got 'nonsense'",
+        ),
         ("bench nonsense", "one of speed, precision, extremes, got"),
         ("bench sped", "did you mean speed?"),
     ],

@@ -196,8 +196,9 @@ def test_measures_have_their_spread(tmp_path: Path) -> None:
     [
         ({"": {"test": views(20.0, 24.0)}}, "PSNR on 2 photos held out of the training: 22.0 dB"),
         ({"off": {"test": views(20.0)}, "on": {"test": views(30.0)}}, "1 photo held out of the training: 20.0 dB off"),
-        ({"": {"train": views(33.0)}}, "was not measured (kgs fit with --hold-out 8 measures it)"),
+        ({"": {"train": views(33.0)}}, "was not measured (kgs fit with --measure or --hold-out does)"),
         ({"": {"train": views(4.9)}}, "PSNR on the 1 photo it was trained on: 4.9 dB. That says little"),
+        ({"": {"test": None, "held_out": views(27.0), "train": views(33.0)}}, "27.0 dB, that is close to the photos"),
         ({"": {"test": views(4.9)}}, "4.9 dB, that is not the scene of the photos."),
         ({"": {"views": views(27.0)}}, "PSNR on 1 photo: 27.0 dB."),
         ({"": {"test": {"psnr": None, "views": [{"name": "a", "psnr": None}]}}}, "not measured."),

@@ -62,6 +62,10 @@ def test_pictures_and_pages_are_shrunk_and_have_a_background(splat, llff, tmp_pa
     assert '"background":[1.0,1.0,1.0]' in text
     with pytest.raises(ValueError, match="downscale: expected photos of at least 11 pixels a side, got 8x6"):
         page(splat, cameras=llff, out=tmp_path / "page.html", downscale=5.0)
+    with pytest.raises(ValueError, match="size: expected either a size or a downscale factor, got both"):
+        page(splat, cameras=llff, out=tmp_path / "page.html", size=32, downscale=5.0)
+    page(splat, cameras=llff, out=tmp_path / "page.html", size=32)
+    assert "32 × 24 pixels" in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("tag", [None, "SplatRenderMode: mip", "antialiased 1"])

@@ -101,6 +101,28 @@ def test_a_folder_of_photos_becomes_a_fit(folder, tmp_path, capsys, monkeypatch)
     assert run("eval", tmp_path / "moved") == 0
 
 
+def test_cameras_alone_make_a_scene_that_is_fitted_as_its_photos_are(folder, tmp_path, capsys):
+    photos = folder(4)
+    scene = tmp_path / "scene"
+    assert run("poses", photos, "-o", scene) == 0
+    assert f"next: kgs fit {scene} -o scene-fit" in capsys.readouterr().out
+    splats = []
+    for source in (photos, scene):
+        out = tmp_path / f"of {source.name}"
+        assert run("fit", source, "-o", out, *FIT) == 0
+        splats.append((out / "splat.ply").read_bytes())
+    assert splats[0] == splats[1]
+    capsys.readouterr()
+    for source, out, said in (
+        (scene, tmp_path / "more", "has camera poses"),
+        (photos, tmp_path / "of photos4", "holds a fit"),
+    ):
+        assert run("poses", source, "-o", out) == 3
+        assert said in one_line(capsys)
+    assert run("poses", photos, "-o", tmp_path / "more", "--frames", 5) == 2
+    assert not (tmp_path / "more").exists()
+
+
 def test_half_of_the_steps_are_coarse_at_the_size_that_the_command_chooses(folder, tmp_path, monkeypatch):
     seen = []
 
@@ -117,9 +139,32 @@ def test_half_of_the_steps_are_coarse_at_the_size_that_the_command_chooses(folde
         (["--detail", "low"], DETAILS["low"].entries["coarse"]),
         (["--preset", "paper"], 0.0),
     ]
+    assert run("poses", photos, "-o", tmp_path / "scene") == 0
     for options, _ in cases:
-        assert run("fit", photos, "-o", tmp_path / "out", *options) == 3
-    assert seen == [coarse for _, coarse in cases]
+        for source in (photos, tmp_path / "scene"):
+            assert run("fit", source, "-o", tmp_path / f"{source.name} out", *options) == 3
+    assert seen == [coarse for _, coarse in cases for _ in range(2)]
+
+
+def test_a_second_fit_measures_a_photo_that_it_leaves_out(folder, tmp_path, capsys):
+    photos = folder(5)
+    splats = []
+    for out, options in (("without", ["--hold-out", 5]), ("measured", []), ("measured", ["--measure", "--resume"])):
+        assert run("fit", photos, "-o", tmp_path / out, *FIT, *options) == 0
+        splats.append((tmp_path / out / "splat.ply").read_bytes())
+    said = capsys.readouterr().out
+    assert splats[1] == splats[2]  # of all photos
+    metrics = json.loads((tmp_path / "measured" / "metrics.json").read_text())
+    assert (metrics["test"], len(metrics["train"]["views"])) == (None, 5)
+    (row,) = metrics["held_out"]["views"]
+    assert f"a fit without {row['name']} shows it with PSNR {row['psnr']:.4g}" in said
+    assert said.count("no photo was held out") == 1
+    assert metrics["held_out"] == json.loads((tmp_path / "without" / "metrics.json").read_text())["test"]
+    page = (tmp_path / "measured" / "index.html").read_text(encoding="utf-8")
+    assert "1 photo held out of another fit with the same settings" in page
+    for options in (["--hold-out", 2], ["--views", 3]):
+        assert run("fit", photos, "-o", tmp_path / "out", "--measure", *options) == 2
+        assert "--measure: expected photos" in one_line(capsys)
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ from targets import SELDOM_INTERPRETED
 
 import kgs
 from kgs import RasterOptions, backends
-from kgs.backends.agreement import BOUND, disagreement
+from kgs.backends.agreement import BOUND, EVERYTHING, FITS, disagreement
 
 
 class Half(backends.TorchBackend):
@@ -89,6 +89,7 @@ def test_kernels_beside_the_renderer_are_numbas_unless_torch_is_named(half):
 
 
 @SELDOM_INTERPRETED
-def test_a_training_step_of_kernels_agrees_with_torch(kernels):
+@pytest.mark.parametrize("steps", [(EVERYTHING,), FITS], ids=["everything", "fits"])
+def test_training_steps_of_kernels_agree_with_torch(kernels, steps):
     backend = next(x for x in backends.BACKENDS if x.name == kernels.backend)
-    assert disagreement(backend, kernels.device) <= BOUND / 10
+    assert disagreement(backend, kernels.device, steps) <= BOUND / 10

@@ -130,7 +130,7 @@ def test_select_takes_rows_and_bands():
                 "sh_degree": {"chosen": 0, "by": "photos", "gain": 0.02, "n": 2000},
                 "gaussians": {"fitted": 200, "kept": 114, "weight": 1.0, "sh_degree": 0},
             },
-            "each colour is the same from all directions: harmonics could gain 0.02 dB; "
+            "each colour is the same from all directions: harmonics could add at most 0.02 dB; "
             "43 % of the Gaussians are removed: no photo needs them",
         ),
     ],

@@ -179,7 +179,7 @@ def test_another_card_is_compiled_for_anew(monkeypatch):
     seen = set()
     real = specialization
     monkeypatch.setattr(module, "specialization", lambda *a: seen.add(a[2][0]) or real(*a))
-    monkeypatch.setattr(module, "_current", lambda device: module.nullcontext())
+    monkeypatch.setattr(module, "current", lambda device: module.nullcontext())
     for index in (0, 1):
         device = SimpleNamespace(type="cpu", index=index)
         monkeypatch.setattr(module, "_device_of", lambda arguments, device=device: device)

@@ -67,12 +67,12 @@ def check_results(out: Path) -> None:
 def check_photos(
     folder: Path,
     out: Path,
-    views: int | None,
-    hold_out: int | None,
-    size: int | None,
-    downscale: float | None,
-    frames: int | None,
-    shortest: int,
+    views: int | None = None,
+    hold_out: int | None = None,
+    size: int | None = None,
+    downscale: float | None = None,
+    frames: int | None = None,
+    shortest: int = 1,
 ) -> None:
     """Check a folder of unposed photos or a video, and the options about them, before their cameras are found.
 

@@ -115,7 +115,7 @@ def clean(
     options = []
     known = options_of_fit(out, SceneSource(fit.scene.root)).get("downscale")
     if (downscale or 1.0) > 1.0 and downscale != known:
-        options += ["--downscale", f"{downscale:g}"]
+        options += ["--size", str(max(fit.scene.train.images.shape[-2:]))]
     if background != "black":
         options += ["--background", background]
     say_next(as_line("kgs", "page", out, "--cameras", fit.scene.root, "-o", out.with_suffix(".html"), *options))

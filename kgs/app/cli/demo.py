@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from kgs._support.errors import printable, quantity
-from kgs.app.console import VIEWER, as_line, each, open_in_browser, say, say_next
+from kgs.app.console import VIEWER, as_line, each, open_in_browser, say, say_next, say_on_terminal
 from kgs.datasets.folders import LAYOUT_FILES
 from kgs.fit.config import DEMO, DEMO_STEPS, ROOM_DEMO, Backend, FitConfig
 
@@ -83,13 +83,14 @@ def demo(
     from kgs._support.machine import device_name
     from kgs.app.demo_scene import CREDIT
     from kgs.app.fit_folder import fit_folder
+    from kgs.app.stages import Stages
     from kgs.metrics.evaluate import as_text
 
     say(f"device: {device_name(found)}")
     request, loaded = _write_scene(scene, out, size, seed, resume)
     height, width = loaded.train.images.shape[-2:]
     say(f"{quantity(len(loaded.train), 'training photo')} of {width}x{height}, {len(loaded.test)} held out")
-    published = fit_folder(loaded, config, out, request, resume=resume)
+    published = fit_folder(loaded, config, out, request, resume=resume, stages=Stages(say_on_terminal))
     splat = published.folder / "splat.ply"
     if published.signal:
         say_next("the same command with --resume goes on where it stopped")

@@ -3,6 +3,7 @@
 import inspect
 import os
 import re
+import sys
 import warnings
 from contextlib import nullcontext
 from dataclasses import MISSING, field, make_dataclass, replace
@@ -13,18 +14,18 @@ from typing import Annotated, Any, Literal, get_type_hints
 import tyro
 
 from kgs._support.errors import ArgumentError, DataError, printable, quantity
-from kgs.app.console import VIEWER, as_line, is_terminal, open_in_browser, say, say_next
+from kgs.app.console import VIEWER, as_line, open_in_browser, say, say_next, say_on_terminal
 from kgs.fit.config import COARSE, DETAILS, PRESETS, Background, FitConfig, min_side
 
 from .checks import SMALLEST, check_photos, check_photos_of, check_roll, check_side
 from .options import QUIET, Flag, IfGiven, Open, Out
 from .tools import check_installed, load_tools
-from .unposed import find_scene, on_ctrl_c, open_scene
+from .unposed import check_frames, find_scene, is_posed_by_kgs, on_ctrl_c, open_scene
 from .words import options_in
 
 # The short help shows these entries of FitConfig, and all other options of the command but the rare ones.
 _OF_CONFIG = ("steps", "drop", "refine_poses", "seed", "device")
-_RARE = ("downscale", "background", "lpips_weights", "mask_mode", "frames", "title", "live", "config")
+_RARE = ("downscale", "background", "lpips_weights", "mask_mode", "roll", "frames", "title", "live", "config")
 
 
 def first_config(words: list[str]) -> FitConfig:
@@ -60,6 +61,7 @@ def fit(
     mask_mode: Literal["ignore", "transparent"] = "ignore",
     preset: Literal["auto", "paper", "plain"] = "auto",
     detail: Literal["low", "normal", "high"] = "normal",
+    measure: Flag = False,
     resume: Flag = False,
     title: IfGiven[str] = None,
     no_photos: Flag = False,
@@ -96,7 +98,8 @@ def fit(
             without dropping. See --preset paper --help-all.
         detail: sets size, steps and initial points together. low: 378 pixels. high: 1000 pixels. Options given by name
             win. See --detail high --help-all.
-        resume: continue the unfinished fit in the folder of the results, or the finished one.
+        measure: measure a photo that a second fit leaves out. Only of unposed photos; it takes nearly twice as long.
+        resume: continue the fit in OUT, unfinished or finished.
         title: of the page. Unless given: the name of the folder.
         no_photos: leave the photos out of the page.
         roll: turn page and film clockwise by so many degrees.
@@ -115,12 +118,18 @@ def fit(
 
     source = open_scene(scene)
     unposed = source is None
+    as_photos = source is None or is_posed_by_kgs(source)
+    if measure and (not as_photos or hold_out or views is not None):
+        reason = "photos without camera poses, and neither --hold-out nor --views: these hold photos out themselves"
+        raise ArgumentError(f"measure: expected {reason}")
+    if as_photos and hold_out is None:
+        hold_out = 0
     check_roll(roll)
     _check_size(size, downscale, unposed)
     if views is not None and views < 1:
         raise ArgumentError(f"views: expected a whole number of at least 1, got {views}")
     check_options(downscale, hold_out)
-    _check_frames(frames, scene)
+    check_frames(frames, scene)
     if lpips_weights is not None:
         weight_files(lpips_weights)
     check_folder(out, scene, make=False)
@@ -143,6 +152,7 @@ def fit(
 
     from kgs._support.machine import device_name
     from kgs.app.fit_folder import fit_folder
+    from kgs.app.held_out import MIN_PHOTOS, measure_held_out
     from kgs.app.scene_request import SceneRequest
     from kgs.app.stages import Stages
     from kgs.datasets import load_scene
@@ -171,12 +181,12 @@ def fit(
     )
     is_free = size is None and downscale is None  # the size follows from --detail
     say(f"device: {device_name(device)}")
-    stages = Stages(say if is_terminal() else lambda line: None, unposed)
-    if is_free and (detail != "normal" or (unposed and device.type == "cpu")):
+    stages = Stages(say_on_terminal, unposed, measure)
+    if is_free and (detail != "normal" or (as_photos and device.type == "cpu")):
         size = DETAILS[detail].size
         if config.coarse is None:
             config = replace(config, coarse=COARSE)
-    if preset in ("paper", "plain") and size is None and downscale is None and not unposed:
+    if preset in ("paper", "plain") and size is None and downscale is None and not as_photos:
         size = "field"
     if source is None:
         stages.begin("cameras")
@@ -203,13 +213,24 @@ def fit(
     kept = f"{quantity(len(loaded.train), 'training photo')} of {width}x{height}"
     say(f"{printable(scene)}: {kept}, {len(loaded.test) or 'none'} held out")
     with on_ctrl_c("the cameras that were found are kept" if unposed else ""):
-        published = fit_folder(loaded, config, out, request, resume=resume, lpips=lpips, live=live, stages=stages)
+        held_out: dict[str, Any] = {}
+        if measure and len(loaded.train) < MIN_PHOTOS:
+            say(f"other views are not measured: --measure needs at least {MIN_PHOTOS} photos")
+        elif measure:
+            stages.begin("measurement")
+            held_out, stopped_by = measure_held_out(request, source, len(loaded.train), config, lpips, say)
+            if stopped_by:
+                say("stopped in the measurement: the fit was not begun", sys.stderr)
+                return 128 + stopped_by
+        published = fit_folder(
+            loaded, config, out, request, resume=resume, lpips=lpips, held_out=held_out, live=live, stages=stages
+        )
     metrics = published.fit.metrics
     say(as_text(metrics))
     posed = out if unposed else scene
     splat = published.folder / "splat.ply"
     renders = out / "renders"
-    say(f"{printable(splat)}: {metrics['gaussians']} Gaussians after {metrics['steps']} steps")
+    say(f"{printable(splat)}: {quantity(metrics['gaussians'], 'Gaussian')} after {quantity(metrics['steps'], 'step')}")
     if needless := left_out(published.fit.decisions):
         say(needless)
     if published.signal:
@@ -261,13 +282,3 @@ def _check_size(size: int | str | None, downscale: float | None, unposed: bool) 
         raise ArgumentError(f"size: expected pixels for photos without camera poses, got {size!r}")
     if isinstance(size, int):
         check_side(size)
-
-
-def _check_frames(frames: int | None, scene: Path) -> None:
-    """Raise a ValueError unless so many frames can be taken from a video."""
-    from kgs.app.sfm.find import MIN_PHOTOS, find_video
-
-    if frames is not None and frames < MIN_PHOTOS:
-        raise ArgumentError(f"frames: expected at least {MIN_PHOTOS}, got {frames}")
-    if frames is not None and find_video(scene) is None:
-        raise ArgumentError("frames: expected a video to take them from, got photos")

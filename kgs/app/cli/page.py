@@ -8,7 +8,7 @@ from kgs._support.errors import ArgumentError, printable, quantity
 from kgs.app.console import as_line, open_in_browser, say, say_next
 from kgs.fit.config import Backend, Background
 
-from .checks import check_file, check_photos_of, check_roll
+from .checks import check_file, check_photos_of, check_roll, check_side
 from .inputs import load_cameras, load_splat, options_of_fit
 from .options import Flag, IfGiven, Open, Out
 from .tools import load_tools
@@ -23,6 +23,7 @@ def page(
     *,
     cameras: Path,
     out: Out = Path("index.html"),
+    size: IfGiven[int] = None,
     downscale: IfGiven[float] = None,
     background: Background = "black",
     no_photos: Flag = False,
@@ -41,8 +42,9 @@ def page(
         ply: a 3DGS PLY file.
         cameras: the scene (folder of LLFF, COLMAP, Blender or nerfstudio) whose cameras and photos to use.
         out: the HTML file to write.
-        downscale: reduce the photos by this factor. Unless given: to the size of the fit, where the splat or the scene
-            is in the folder of one.
+        size: reduce the photos to this many pixels on their longer side. Unless given: to the size of the fit, where
+            the splat or the scene is in the folder of one.
+        downscale: reduce the photos by this factor instead.
         background: the colour behind the splat, and behind photos with transparency.
         no_photos: leave out the photos beside their renders: the page is smaller, and can go where the photos must not.
         roll: turn all pictures clockwise by this angle in degrees, where photos lie on their side.
@@ -55,6 +57,10 @@ def page(
 
     check_roll(roll)
     check_options(downscale, None)
+    if size is not None and downscale is not None:
+        raise ArgumentError("size: expected either a size or a downscale factor, got both")
+    if size is not None:
+        check_side(size)
     check_file(out, ".html", "page")
     source = SceneSource(cameras)
     check_photos_of(source)
@@ -68,12 +74,16 @@ def page(
     from kgs.metrics.evaluate import evaluate
 
     options = {**options_of_fit(ply, source), "background": background}
+    if size is not None:
+        whole = load_scene(source, photos=False, hold_out=0).train
+        downscale = max(1.0, max(whole.images.shape[-2:]) / size)
     if downscale is not None:
         options |= {"downscale": downscale, "photo_folder": ""}
     scene = load_cameras(source, **options)
     height, width = scene.train.images.shape[-2:]
     if min(height, width) < WINDOW:
-        raise ArgumentError(f"downscale: expected photos of at least {WINDOW} pixels a side, got {width}x{height}")
+        name = "downscale" if size is None else "size"
+        raise ArgumentError(f"{name}: expected photos of at least {WINDOW} pixels a side, got {width}x{height}")
     fit = load_splat(ply, scene, torch_device, backend)
     few = spread(len(scene.train), MAX_PICTURES)
     photographed = load_scene(source, len(few), hold_out=0, **options)

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Literal
 
-from kgs._support.errors import printable
+from kgs._support.errors import printable, quantity
 from kgs.app.console import VIEWER, as_line, each, say, say_next
 from kgs.fit.config import Backend, Background
 
@@ -72,5 +72,5 @@ def render(
                 image = torch.cat([image / rendering.alpha.clamp_min(1e-6), rendering.alpha], 1)
             write_png(new / names[name], as_taken(image[0], scene.train, i))
     height, width = scene.train.images.shape[-2:]
-    say(f"{len(names)} pictures of {width}x{height} in {printable(out)}")
+    say(f"{quantity(len(names), 'picture')} of {width}x{height} in {printable(out)}")
     say_next(VIEWER.format(as_line(ply)))

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from kgs._support.errors import ArgumentError, DataError, PhotosRefused, TrainingDiverged, printable
-from kgs.app.console import as_line, quiet, say
+from kgs.app.console import as_line, log_shown, quiet, say
 from kgs.fit.config import FitConfig, Recipe
 
 from .interrupts import interrupt_as_usual
@@ -30,6 +30,7 @@ from .words import options_in, take_quiet
 COMMANDS = {
     "demo": "kgs.app.cli.demo:demo",
     "fit": "kgs.app.cli.fit:fit",
+    "poses": "kgs.app.cli.poses:poses",
     "render": "kgs.app.cli.render:render",
     "eval": "kgs.app.cli.evaluate:evaluate",
     "page": "kgs.app.cli.page:page",
@@ -70,7 +71,7 @@ def exit_code(words: list[str]) -> int:
         command = load_command(name)
         flags = _flags_of(command)
         call = _parse(command, name, words)
-        with quiet(is_quiet):
+        with quiet(is_quiet), log_shown():
             return int(call() or 0)
     except SystemExit as stop:
         if not isinstance(stop.code, str):

@@ -1,7 +1,6 @@
 """What has to be installed for a command: it is loaded here, and an error says what brings a missing package."""
 
 import sys
-import threading
 import traceback
 from contextlib import suppress
 from importlib import import_module
@@ -18,7 +17,6 @@ if TYPE_CHECKING:
     import torch
 
 _ALWAYS = ("torch", "kornia", "numpy", "cv2", "PIL")
-_SILENCE = 5.0  # seconds that the check of a GPU may take without a word
 
 
 def check_installed(*packages: str) -> None:
@@ -53,11 +51,12 @@ def load_tools(device: str = "cpu", backend: str = "auto", *packages: str) -> "t
     for package in packages:
         load_package(package)
     from kgs._support.machine import check_device
+    from kgs.backends import resolve
 
     if device == "auto":
         return _best_device(backend)
     found = check_device(device)
-    _resolve(backend, found)
+    resolve(backend, found)
     return found
 
 
@@ -69,35 +68,21 @@ def _best_device(backend: str) -> "torch.device":
     import torch
 
     from kgs._support.machine import check_device
+    from kgs.backends import resolve
 
     cpu = torch.device("cpu")
     gpu = next((kind for kind in ("cuda", "xpu") if torch.get_device_module(kind).is_available()), None)
     if gpu is not None and backend != "numba":
         try:
             found = check_device(gpu)
-            if _resolve(backend, found) != "torch" or _resolve(backend, cpu) == "torch":
+            if resolve(backend, found) != "torch" or resolve(backend, cpu) == "torch":
                 return found
             why = f"--device {gpu} takes the GPU, with torch's operators in place of kernels"
         except ValueError as error:
             why = printable(error)
         say(f"kgs: the CPU is used: {why}", sys.stderr)
-    _resolve(backend, cpu)
+    resolve(backend, cpu)
     return cpu
-
-
-def _resolve(backend: str, device: "torch.device") -> str:
-    """The backend that is taken on a device; a line says why it takes long, where kernels are compiled for a GPU."""
-    from kgs.backends import resolve
-
-    line = "the kernels for the GPU are checked; the first time on a machine they are compiled, in about a minute"
-    timer = threading.Timer(_SILENCE, say, [line])
-    timer.daemon = True
-    if device.type != "cpu":
-        timer.start()
-    try:
-        return resolve(backend, device)
-    finally:
-        timer.cancel()
 
 
 def load_package(package: str) -> None:

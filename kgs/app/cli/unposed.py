@@ -1,4 +1,4 @@
-"""`kgs fit` of unposed photos: finds their cameras, and makes a scene of them in the folder of the results."""
+"""Unposed photos: `kgs fit` finds their cameras, and makes a scene of them in the folder of the results."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -6,9 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kgs._support.errors import DataError
+from kgs._support.errors import ArgumentError, DataError
 from kgs.app.console import each, say
-from kgs.datasets.folders import VIDEO_SUFFIXES, layout_of, scene_nearby, why_no_scene
+from kgs.datasets.folders import CAMERAS_REPORT, VIDEO_SUFFIXES, layout_of, scene_nearby, why_no_scene
 from kgs.datasets.source import SceneSource
 
 if TYPE_CHECKING:
@@ -50,11 +50,11 @@ def find_scene(
     """
     from kgs.app.scene_request import in_plain_words
     from kgs.app.sfm import pose_photos
-    from kgs.app.sfm.find import find_video, notes_on
+    from kgs.app.sfm.find import find_video
 
     video = find_video(photos)
     masks = Path(request.masks) if request.masks else None
-    for note in () if video else notes_on(photos, masks):
+    for note in notes_on_photos(photos, masks):
         say(note)
     with on_ctrl_c("the cameras were not found yet, and nothing was written"):
         report = pose_photos(photos, out, seed=seed, masks=masks, frames=frames, wait=True, bar=each, say=say)
@@ -73,6 +73,28 @@ def find_scene(
         masks="",  # they are beside the copies of the photos
     )
     return loaded_as, SceneSource(report["folder"])
+
+
+def is_posed_by_kgs(source: SceneSource) -> bool:
+    """Whether a scene is of photos whose cameras kgs found: it is fitted as the photos alone would be."""
+    return source.layout == "COLMAP" and (source.root / CAMERAS_REPORT).is_file()
+
+
+def check_frames(frames: int | None, photos: Path) -> None:
+    """Raise an ArgumentError unless so many frames can be taken from a video."""
+    from kgs.app.sfm.find import MIN_PHOTOS, find_video
+
+    if frames is not None and frames < MIN_PHOTOS:
+        raise ArgumentError(f"frames: expected at least {MIN_PHOTOS}, got {frames}")
+    if frames is not None and find_video(photos) is None:
+        raise ArgumentError("frames: expected a video to take them from, got photos")
+
+
+def notes_on_photos(photos: Path, masks: Path | None) -> list[str]:
+    """What is to be said about a folder of unposed photos, as :func:`kgs.app.sfm.find.notes_on`; nothing of a video."""
+    from kgs.app.sfm.find import find_video, notes_on
+
+    return [] if find_video(photos) else list(notes_on(photos, masks))
 
 
 @contextmanager

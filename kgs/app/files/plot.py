@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 # Names of the sets of views by their keys in metrics.json.
-PARTS = {"test": "held out", "train": "training", "views": "photos"}
+PARTS = {"test": "held out", "held_out": "held out of another fit", "train": "training", "views": "photos"}
 # The plot, in its own units: its size, and the borders of the area with the lines.
 _WIDTH = 640
 _HEIGHT = 260

@@ -69,19 +69,22 @@ def verdict(runs: Runs) -> str:
     photos = quantity(len(next(iter(measured.values()))["views"]), "photo")
     which = {
         "test": f"{photos} held out of the training",
+        "held_out": f"{photos} held out of another fit with the same settings",
         "train": f"the {photos} it was trained on",
         "views": photos,
     }[part]
     text = f"PSNR on {which}: not measured."
     if levels:
         numbers = ", ".join(with_run(f"{level:.1f} dB", run).replace(", ", " ") for run, level in levels.items())
-        words = f", that is {_in_words(list(levels.values())[-1])}" if part == "test" else ""
+        words = f", that is {_in_words(list(levels.values())[-1])}" if part in ("test", "held_out") else ""
         text = f"PSNR on {which}: {numbers}{words}."
+    if part == "held_out":
+        return f"{text} This splat was trained on all photos."
     if part != "train":
         return text
     unknown = "No photo was held out, so how good new views are was not measured"
     little = " That says little: it was made to show them." if levels else ""
-    return f"{unknown} (kgs fit with --hold-out 8 measures it). {text}{little}"
+    return f"{unknown} (kgs fit with --measure or --hold-out does). {text}{little}"
 
 
 def _in_words(psnr: float) -> str:

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from kgs._support.errors import DataError, listed
+from kgs._support.errors import DataError, listed, quantity
 from kgs.app.files.publishing import MARKER
 from kgs.datasets import folders
 from kgs.datasets.folders import (
@@ -93,7 +93,8 @@ def notes_on(folder: Path, masks: Path | None = None) -> list[str]:
     if called := [path for path in list_photos(folder) if is_like_mask(path)]:
         notes.append(f"named like masks and taken for photos: {listed_files(called)}: {MASKS_ARE_IN}")
     if converted := sorted(_converted(folder)):
-        notes.append(f"{len(converted)} raw or HEIC files are not used, but their JPEGs: {listed_files(converted)}")
+        files = quantity(len(converted), "raw or HEIC file")
+        notes.append(f"{files} not used, the JPEG of the same name is: {listed_files(converted)}")
     return notes
 
 

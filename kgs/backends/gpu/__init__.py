@@ -1,7 +1,8 @@
 """The backend of Triton kernels, for float32 on GPUs.
 
 `activation`, `projection`, `compositing`, `blending`, `loss` and `optimizer` bring the kernels of a stage to torch,
-which stand in the file of kernels beside it; the other files of kernels are parts of these. `launch` calls them, and
+which stand in the file of kernels beside it; the other files of kernels are parts of these. `launch` calls them,
+`compiling` compiles them ahead, `verdict` keeps that they passed :func:`self_check`, and
 `entry_counts` tells compositing what projection has counted. Torch defines what is right; a kernel gives the same
 within the rounding of float32, and its formulas are explained in the torch code that it follows. `import kgs` does not
 import triton: a stage is imported when it is first used.
@@ -14,14 +15,16 @@ Rules:
 2. A number is read from the device only where the size of a tensor follows from it, and with it whether torch must
    do the call: reading waits for all work. A render of one camera reads once.
 3. What a kernel is called with is checked before; it clamps nothing but the indices of masked lanes.
-4. Integers that change in a fit, as the number of Gaussians does, are named in `do_not_specialize`: Triton would
-   compile again in the midst of it.
+4. Integers are named in `do_not_specialize`: Triton would compile again for other numbers of Gaussians and cameras, and
+   for images of another size.
 5. Constants of a module stand to the right of operators; block shapes are powers of two; a loop whose end depends on
    data is a `while` on a scalar.
 """
 
 import functools
 import os
+from collections.abc import Callable
+from contextlib import suppress
 
 import torch
 
@@ -62,6 +65,15 @@ class GpuBackend(Backend):
             return self_check(torch.device(device.type, index))
         except torch.OutOfMemoryError:  # says nothing about the kernels
             return False
+
+    def compile_ahead(self, run: Callable[[torch.device], object], device: torch.device) -> None:
+        """See `Backend.compile_ahead`."""
+        if _is_interpreted():
+            return
+        from .compiling import compile_together, needed_launches
+
+        with suppress(Exception):  # whatever is wrong is met again when it is launched
+            compile_together(needed_launches(lambda: run(torch.device("cpu"))), device)
 
     def covers_compositing(self, call: CompositingCall) -> bool:
         """Only its own tile size, no `chunk_size`, and of many features no `absgrad`: blocks would be added up."""
@@ -119,15 +131,20 @@ def _is_interpreted() -> bool:
 def self_check(device: torch.device) -> bool:
     """Whether a small scene comes out as in torch on a device; a warning says what is wrong.
 
-    The first time on a machine the kernels are compiled, which takes seconds.
+    The first time on a machine the kernels are compiled, which takes seconds, and the log says how far that is. That
+    they have passed is kept on disk, see `.verdict`.
 
     Raises:
         torch.OutOfMemoryError: there is no room for it now; what is raised is not remembered.
     """
-    from kgs.backends.agreement import BOUND, disagreement
+    from kgs.backends.agreement import BOUND, FITS, disagreement
 
+    from . import verdict
+
+    if verdict.is_kept(device):
+        return True
     try:  # twice: from their second call on kernels are launched in another way, see `.launch`
-        differences = [disagreement(GpuBackend(), device) for _ in range(2)]
+        differences = [disagreement(GpuBackend(), device, FITS) for _ in range(2)]
         difference = float(torch.tensor(differences, device="cpu").max())  # NaN stays
     except torch.OutOfMemoryError:
         raise
@@ -135,6 +152,7 @@ def self_check(device: torch.device) -> bool:
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
     else:
         if difference <= BOUND:
+            verdict.keep(device)
             return True
         reason = f"they differ from torch by {difference:.1e}, more than {BOUND:g}"
     warn(f"kgs: Triton's kernels are not used on {device}, torch is: {reason}")

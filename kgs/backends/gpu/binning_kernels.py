@@ -113,7 +113,7 @@ def _count(
     return total
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["height", "width", "image_rows"])
 def count_all_entries(
     numbers, means2d, factors, opacities, eps2d, log2_threshold, height, width, image_rows, counts, sums,
     BLOCK: tl.constexpr,
@@ -141,7 +141,7 @@ def sum_counts(sums, blocks, out, BLOCK: tl.constexpr):
     tl.store(out, tl.sum(total, 0))
 
 
-@triton.jit(do_not_specialize=["begin", "end", "n"])
+@triton.jit(do_not_specialize=["height", "width", "image_rows", "begin", "end", "n"])
 def count_entries(
     order, means2d, factors, opacities, camera_ids, eps2d, log2_threshold, height, width, image_rows, begin, end, n,
     counts, begins,
@@ -163,7 +163,7 @@ def count_entries(
     tl.store(begins + i, i.to(tl.int64), mask=i == 0)
 
 
-@triton.jit(do_not_specialize=["begin", "end", "n"])
+@triton.jit(do_not_specialize=["height", "width", "image_rows", "begin", "end", "n", "columns"])
 def fill_entries(
     order, means2d, factors, opacities, camera_ids, eps2d, log2_threshold, height, width, image_rows, begin, end, n,
     columns, begins, tiles, ranks,

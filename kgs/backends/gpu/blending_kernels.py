@@ -17,7 +17,7 @@ def _color(color, transmittance):
     return tl.where(transmittance == 0.0, tl.where(tl.abs(color) == float("inf"), 0.0, color), color)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["stride", "pixels", "channels"])
 def blend_color(image, transmittance, color, stride, pixels, channels, blended, BLOCK: tl.constexpr):
     """The image plus the transmittance times the colour."""
     c = tl.program_id(1).to(tl.int64)
@@ -33,7 +33,7 @@ def blend_color(image, transmittance, color, stride, pixels, channels, blended, 
         d += 1
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["stride", "pixels", "channels"])
 def color_gradient(grad, transmittance, color, stride, pixels, channels, by_transmittance, BLOCK: tl.constexpr):
     """From the gradient of the image to that of the transmittance."""
     c = tl.program_id(1).to(tl.int64)

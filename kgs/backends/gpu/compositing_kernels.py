@@ -100,7 +100,7 @@ def _feature(features, ids, listed, f, width):
     return tl.load(features + ids * width + f, mask=listed & _exists(f, width, ids), other=0.0)[:, None]
 
 
-@triton.jit(do_not_specialize=["first_tile"])
+@triton.jit(do_not_specialize=["first_tile", "columns", "rows", "height", "width", "channels"])
 def composite_forward(
     table, features, order, entries, offsets, first_tile, columns, rows, height, width, channels, threshold, stop,
     starts, reached, sums, transmittance, depths,
@@ -163,7 +163,7 @@ def composite_forward(
         tl.store(image + size * 3, sum3, mask=inside & _exists(f0 + 3, channels, pixel))
 
 
-@triton.jit(do_not_specialize=["first_tile", "f0"])
+@triton.jit(do_not_specialize=["first_tile", "columns", "rows", "height", "width", "channels", "f0"])
 def composite_backward(
     table, features, order, entries, slots, offsets, first_tile, columns, rows, height, width, channels, threshold,
     stop, starts, reached, grads, grad_transmittance, f0, moments,
@@ -239,7 +239,7 @@ def _column(values, i: tl.constexpr):
     return tl.sum(tl.where(tl.arange(0, 4)[None, :] == i, values, 0.0), 1)
 
 
-@triton.jit(do_not_specialize=["f0", "n"])
+@triton.jit(do_not_specialize=["n", "channels", "f0"])
 def sum_entries(
     order, begins, moments, factors, opacities, eps2d, n, channels, f0, d_means2d, d_factors, d_opacities, d_features,
     d_absolute,

@@ -6,8 +6,10 @@ gives it the pointers from the second call on. What the environment says to Trit
 """
 
 import functools
-from contextlib import AbstractContextManager, nullcontext
-from typing import Any
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextvars import ContextVar
+from typing import Any, NamedTuple
 
 import torch
 import triton
@@ -19,6 +21,7 @@ _MAX_SMALL = 2**31 - 1  # bytes; kernels for AMD's GPUs address tensors of more 
 _IS_AMD = torch.version.hip is not None
 _NOTHING = nullcontext[None]()
 
+_recorded: ContextVar["list[Launch] | None"] = ContextVar("_recorded", default=None)  # see `recorded_launches`
 _compiled: dict[Any, tuple[Any, ...]] = {}  # by the key of `specialization`: what is called, and what has to stay
 _arguments: dict[int, tuple[Any, tuple[bool, ...]]] = {}  # by its id a kernel, which thereby stays, and see below
 
@@ -37,12 +40,12 @@ def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, warps: int = 4, 
         return
     device = _device_of(arguments)
     if device.type not in _DIRECT or _is_watched(kernel):
-        with _current(device):
+        with current(device):
             _launch_by_triton(kernel, grid, arguments, warps, constants)
         return
     key, values = specialization(kernel, arguments, (device.index, warps, *constants.items()))
     known = _compiled.get(key)
-    with _current(device):
+    with current(device):
         if known is None:
             compiled = _launch_by_triton(kernel, grid, arguments, warps, constants)
             if key is not None and all(hasattr(compiled, x) for x in ("run", "function", "packed_metadata")):
@@ -53,6 +56,38 @@ def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, warps: int = 4, 
         run, function, metadata, _ = known
         nothing = (None, None, None)  # for hooks
         run(*(*grid, 1, 1)[:3], _stream(device), function, metadata, *nothing, *values)
+
+
+class Launch(NamedTuple):
+    """What :func:`launch` was called with."""
+
+    kernel: Any
+    grid: tuple[int, ...]
+    arguments: tuple[Any, ...]
+    warps: int
+    constants: dict[str, Any]
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """What Triton takes by name."""
+        # products are fused with sums, in every version of Triton: from 3.10 on it is not the default
+        return {**self.constants, "num_warps": self.warps, "enable_fp_fusion": True}
+
+    @property
+    def key(self) -> Any:
+        """See :func:`specialization`."""
+        return specialization(self.kernel, self.arguments, (self.warps, *self.constants.items()))[0]
+
+
+@contextmanager
+def recorded_launches() -> Iterator[list[Launch]]:
+    """List what this thread launches on a CPU; nothing is launched there."""
+    launches: list[Launch] = []
+    token = _recorded.set(launches)
+    try:
+        yield launches
+    finally:
+        _recorded.reset(token)
 
 
 def specialization(kernel: Any, arguments: tuple[Any, ...], rest: tuple[Any, ...]) -> tuple[Any, list[Any]]:
@@ -102,8 +137,12 @@ def _launch_by_triton(
     kernel: Any, grid: tuple[int, ...], arguments: tuple[Any, ...], warps: int, constants: dict[str, Any]
 ) -> Any:
     """Launch as Triton documents it; returns what was compiled, or None."""
-    # products are fused with sums, in every version of Triton: from 3.10 on it is not the default
-    return kernel[grid](*arguments, **constants, num_warps=warps, enable_fp_fusion=True)
+    called = Launch(kernel, grid, arguments, warps, constants)
+    recorded = _recorded.get()
+    if recorded is None:
+        return kernel[grid](*arguments, **called.options)
+    recorded.append(called)
+    return None
 
 
 def _is_watched(kernel: Any) -> bool:
@@ -164,7 +203,7 @@ def _stream(device: torch.device) -> int:
     return stream
 
 
-def _current(device: torch.device) -> AbstractContextManager[Any]:
+def current(device: torch.device) -> AbstractContextManager[Any]:
     """Makes the device the current one, where there are several of its kind: Triton launches on that one."""
     if device.type == "cpu" or device.index is None or _is_alone(device.type):
         return _NOTHING

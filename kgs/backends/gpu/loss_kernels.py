@@ -60,7 +60,7 @@ def _folded(maps, base, i, stride, length, mask, t0, t1, t2, t3, t4, t5):
     return total
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["pixels", "width"])
 def sum_across(image, target, pixels, width, t0, t1, t2, t3, t4, t5, across, BLOCK: tl.constexpr):
     """The window along rows, of x, x^2 and x y."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -83,7 +83,7 @@ def sum_across(image, target, pixels, width, t0, t1, t2, t3, t4, t5, across, BLO
     tl.store(across + 2 * pixels + i, product, mask=inside)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["pixels", "height", "width", "blocks"])
 def ssim_maps(
     image, target, mean_y, variance_y, pixels, height, width, t0, t1, t2, t3, t4, t5, across, maps, sums, blocks,
     BLOCK: tl.constexpr,
@@ -121,7 +121,7 @@ def ssim_maps(
     tl.store(sums + blocks + tl.program_id(0), tl.sum(tl.where(inside, ssim, 0.0), 0))
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["blocks", "pixels"])
 def add_up(sums, blocks, pixels, dssim_weight, loss, WIDE: tl.constexpr, BLOCK: tl.constexpr):
     """The loss from the sums over blocks, in float64 with `WIDE`. One program."""
     kind: tl.constexpr = tl.float64 if WIDE else tl.float32
@@ -139,7 +139,7 @@ def add_up(sums, blocks, pixels, dssim_weight, loss, WIDE: tl.constexpr, BLOCK: 
     tl.store(loss, (tl.sum(absolute, 0) / pixels + dssim_weight * (1.0 - mean)).to(tl.float32))
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["pixels", "height", "width"])
 def fold_down(maps, pixels, height, width, t0, t1, t2, t3, t4, t5, down, BLOCK: tl.constexpr):
     """The adjoint of the window along columns, of one of the maps."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -150,7 +150,7 @@ def fold_down(maps, pixels, height, width, t0, t1, t2, t3, t4, t5, down, BLOCK: 
     tl.store(down + first + i, total, mask=inside)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["pixels", "width"])
 def gradient_across(
     image, target, pixels, width, t0, t1, t2, t3, t4, t5, down, by_ssim, by_l1, by_loss, grad, BLOCK: tl.constexpr
 ):  # fmt: skip

@@ -31,7 +31,7 @@ class GpuOptimizer(OptimizerStages):
                 root = math.sqrt(1.0 - beta2**step)
                 arguments += (parameter, gradient.contiguous(), exp_avg, exp_avg_sq, n, step_size, root)
             arguments += (*arguments[:4], 0, 0.0, 1.0) * (_TENSORS - len(some))  # have no block
-            launch(update_by_adam, (count,), *arguments, BETA1=beta1, BETA2=beta2, EPS=eps, BLOCK=_BLOCK)
+            launch(update_by_adam, (count,), *arguments, eps, BETA1=beta1, BETA2=beta2, BLOCK=_BLOCK)
 
     def add_gradient_norms(
         self, sums: Tensor, counts: Tensor, ids: Tensor, gradient: Tensor, scale: tuple[float, float]

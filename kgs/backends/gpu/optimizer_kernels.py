@@ -11,8 +11,8 @@ from .footprint_kernels import is_finite
 
 @triton.jit
 def _update(
-    parameter, gradient, exp_avg, exp_avg_sq, n, block, step_size, root,
-    BETA1: tl.constexpr, BETA2: tl.constexpr, EPS: tl.constexpr, BLOCK: tl.constexpr,
+    parameter, gradient, exp_avg, exp_avg_sq, n, block, step_size, root, eps,
+    BETA1: tl.constexpr, BETA2: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """One block of one tensor of n elements."""
     i = block.to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -23,7 +23,7 @@ def _update(
     first += (g - first) * (1.0 - BETA1)
     second = second * BETA2 + g * g * (1.0 - BETA2)
     value = tl.load(parameter + i, mask=inside, other=0.0)
-    tl.store(parameter + i, value - step_size * first / (tl.sqrt(second) / root + EPS), mask=inside)
+    tl.store(parameter + i, value - step_size * first / (tl.sqrt(second) / root + eps), mask=inside)
     tl.store(exp_avg + i, first, mask=inside)
     tl.store(exp_avg_sq + i, second, mask=inside)
 
@@ -31,8 +31,8 @@ def _update(
 @triton.jit(do_not_specialize=["n0", "n1", "n2", "n3", "n4", "n5"])
 def update_by_adam(
     p0, g0, a0, s0, n0, size0, root0, p1, g1, a1, s1, n1, size1, root1, p2, g2, a2, s2, n2, size2, root2,
-    p3, g3, a3, s3, n3, size3, root3, p4, g4, a4, s4, n4, size4, root4, p5, g5, a5, s5, n5, size5, root5,
-    BETA1: tl.constexpr, BETA2: tl.constexpr, EPS: tl.constexpr, BLOCK: tl.constexpr,
+    p3, g3, a3, s3, n3, size3, root3, p4, g4, a4, s4, n4, size4, root4, p5, g5, a5, s5, n5, size5, root5, eps,
+    BETA1: tl.constexpr, BETA2: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """A step of Adam for six tensors, whose blocks follow one another.
 
@@ -46,17 +46,17 @@ def update_by_adam(
     end3 = end2 + tl.cdiv(n3, BLOCK)
     end4 = end3 + tl.cdiv(n4, BLOCK)
     if block < end0:
-        _update(p0, g0, a0, s0, n0, block, size0, root0, BETA1, BETA2, EPS, BLOCK)
+        _update(p0, g0, a0, s0, n0, block, size0, root0, eps, BETA1, BETA2, BLOCK)
     elif block < end1:
-        _update(p1, g1, a1, s1, n1, block - end0, size1, root1, BETA1, BETA2, EPS, BLOCK)
+        _update(p1, g1, a1, s1, n1, block - end0, size1, root1, eps, BETA1, BETA2, BLOCK)
     elif block < end2:
-        _update(p2, g2, a2, s2, n2, block - end1, size2, root2, BETA1, BETA2, EPS, BLOCK)
+        _update(p2, g2, a2, s2, n2, block - end1, size2, root2, eps, BETA1, BETA2, BLOCK)
     elif block < end3:
-        _update(p3, g3, a3, s3, n3, block - end2, size3, root3, BETA1, BETA2, EPS, BLOCK)
+        _update(p3, g3, a3, s3, n3, block - end2, size3, root3, eps, BETA1, BETA2, BLOCK)
     elif block < end4:
-        _update(p4, g4, a4, s4, n4, block - end3, size4, root4, BETA1, BETA2, EPS, BLOCK)
+        _update(p4, g4, a4, s4, n4, block - end3, size4, root4, eps, BETA1, BETA2, BLOCK)
     else:
-        _update(p5, g5, a5, s5, n5, block - end4, size5, root5, BETA1, BETA2, EPS, BLOCK)
+        _update(p5, g5, a5, s5, n5, block - end4, size5, root5, eps, BETA1, BETA2, BLOCK)
 
 
 @triton.jit(do_not_specialize=["m"])

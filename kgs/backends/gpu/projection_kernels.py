@@ -24,7 +24,7 @@ _COVERED: tl.constexpr = tl.constexpr(COVERED)
 _CUTOFF: tl.constexpr = tl.constexpr(CUTOFF)
 
 
-@triton.jit(do_not_specialize=["n", "blocks"])
+@triton.jit(do_not_specialize=["n", "views", "features", "cameras", "blocks"])
 def check_gaussians(
     means, quats, scales, opacities, colors, n, views, features, cameras, blocks, flags, counts, largest,
     BLOCK: tl.constexpr,
@@ -161,7 +161,7 @@ def _largest(xx, xy, yy):
     return 0.5 * (xx + yy) + scale * tl.sqrt(half / scale * (half / scale) + xy / scale * (xy / scale))
 
 
-@triton.jit(do_not_specialize=["n", "blocks"])
+@triton.jit(do_not_specialize=["height", "width", "n", "blocks"])
 def find_visible(
     means, quats, scales, cameras, near, eps2d, height, width, n, blocks, flags, counts, BLOCK: tl.constexpr
 ):  # fmt: skip
@@ -181,7 +181,7 @@ def find_visible(
     tl.store(counts + c * blocks + b, tl.sum(touches.to(tl.int64), 0))
 
 
-@triton.jit(do_not_specialize=["n", "blocks"])
+@triton.jit(do_not_specialize=["count", "n", "blocks"])
 def number_rows(cameras, count, n, blocks, counts, numbers, BLOCK: tl.constexpr):
     """Where the rows of each block begin, in place of its count; and `numbers`, but for the entries. One program."""
     i = tl.arange(0, BLOCK)
@@ -227,7 +227,7 @@ def _direction(camera, mx, my, mz):
     return x / norm, y / norm, z / norm, 1.0 / norm / peak
 
 
-@triton.jit(do_not_specialize=["n", "blocks"])
+@triton.jit(do_not_specialize=["n", "blocks", "views"])
 def list_visible(
     means, quats, scales, opacities, colors, cameras, flags, counts, near, eps2d, n, blocks, views, means2d, factors,
     depths, alphas, rgb, radii, camera_ids, ids,
@@ -390,7 +390,7 @@ def _pose_totals(out, i: tl.constexpr, camera, moved, j, h, mx, my, mz, u0, u1, 
     _total(out + 4 * i + 3, moved + turned, visible)
 
 
-@triton.jit(do_not_specialize=["c", "n", "blocks"])
+@triton.jit(do_not_specialize=["c", "n", "blocks", "views"])
 def footprint_gradients(
     c, means, quats, scales, colors, cameras, flags, counts, n, blocks, views, g_means2d, g_factors, g_depths, g_alphas,
     g_rgb, d_means, d_quats, d_scales, d_opacities, d_colors, totals,

@@ -1,0 +1,53 @@
+"""Measures how good other views are: on a photo that a fit of the other photos did not have."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from kgs.app.console import each
+from kgs.app.fit_folder import train
+from kgs.datasets.source import SceneSource
+from kgs.fit.config import FitConfig
+from kgs.fit.measures import measure
+from kgs.fit.plan import make_plan
+from kgs.fit.run import choose_points, decide
+from kgs.fit.trainer import Trainer
+from kgs.metrics.lpips import Lpips
+
+from .scene_request import SceneRequest
+
+MIN_PHOTOS = 4  # three to fit, and one to measure
+
+
+def measure_held_out(
+    request: SceneRequest,
+    source: SceneSource,
+    photos: int,
+    config: FitConfig,
+    lpips: Lpips | None = None,
+    say: Callable[[str], None] | None = None,
+) -> tuple[dict[str, Any], int]:
+    """Fit all photos but one from the middle of the row of cameras, and measure that one. Nothing is written.
+
+    Args:
+        request: how the scene is loaded; all photos are training views.
+        source: the folder of a scene whose cameras kgs found.
+        photos: how many it has, at least `MIN_PHOTOS`.
+        config: the settings of the fit of all photos, which are those of this fit.
+        lpips: the perceptual metric, or None to leave it out.
+        say: gets the notes of the fit.
+
+    Returns:
+        The measures of the photo, as "test" in metrics.json has them, and the number of the signal that ended the
+        training, or 0.
+    """
+    scene = replace(request, hold_out=photos).load(Path(source.root), None, source)
+    plan = make_plan(scene, replace(config, evaluations=1))
+    points = choose_points(scene, config, each)
+    fit, signal = train(Trainer(scene, decide(plan, points), points), None, title="measurement")
+    if say is not None:
+        for note in fit.notes:
+            say(note)
+    metrics = {} if signal else measure(fit, lpips)
+    return metrics.get("color_corrected") or metrics.get("test") or {}, signal

@@ -1,0 +1,76 @@
+"""That the kernels have passed their check on a card is kept on disk, beside what Triton has compiled for it.
+
+A failed check is not kept: the next process checks again.
+"""
+
+import hashlib
+import json
+import platform
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import torch
+import triton
+from triton.runtime.cache import get_cache_manager
+
+from kgs._support.version import __version__
+
+_FILE = "kgs_self_check.json"
+_DRIVERS = ("nvidia", "amdgpu", "xe", "i915")  # modules of Linux
+
+
+def is_kept(device: torch.device) -> bool:
+    """Whether a check has passed with this card, driver, torch, Triton and kernels; False where it cannot be read.
+
+    Args:
+        device: a GPU.
+    """
+    with suppress(Exception):  # a cache that is damaged, or cannot be read, or another one than Triton's own
+        subject = _subject(device)
+        path = _cache(subject).get_file(_FILE)
+        return path is not None and bool(json.loads(Path(path).read_text(encoding="utf-8")) == subject)
+    return False
+
+
+def keep(device: torch.device) -> None:
+    """Keep that the check has passed; does nothing where it cannot be written."""
+    with suppress(Exception):
+        subject = _subject(device)
+        _cache(subject).put(json.dumps(subject, indent=1), _FILE, binary=False)
+
+
+def _cache(subject: dict[str, str]) -> Any:
+    """The folder of a check, as Triton has one for each kernel."""
+    return get_cache_manager(hashlib.sha256(json.dumps(subject).encode()).hexdigest())
+
+
+def _subject(device: torch.device) -> dict[str, str]:
+    """What the outcome depends on."""
+    card = torch.get_device_module(device).get_device_properties(device)
+    return {
+        "card": f"{card.name} {getattr(card, 'gcnArchName', '')}".strip(),
+        "driver": _driver(card),
+        "torch": torch.__version__,
+        "triton": triton.__version__,
+        "kgs": __version__,
+        "source": _source(),
+    }
+
+
+def _driver(card: Any) -> str:
+    """What is known of the versions of the driver; some are a part of Linux."""
+    found = [platform.release(), str(getattr(card, "driver_version", ""))]
+    if hasattr(torch._C, "_cuda_getDriverVersion"):
+        found.append(str(torch._C._cuda_getDriverVersion()))
+    for name in _DRIVERS:
+        with suppress(OSError):
+            found.append(f"{name} {Path('/sys/module', name, 'version').read_text(encoding='utf-8').strip()}")
+    return ", ".join(filter(None, found))
+
+
+def _source() -> str:
+    """A hash of the kernels, and of what calls and checks them."""
+    folder = Path(__file__).parent
+    files = [*sorted(folder.glob("*.py")), folder.parent / "agreement.py"]
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()

@@ -1,0 +1,93 @@
+"""That the kernels have passed their check is kept between processes, for one card and one version of all."""
+
+import warnings
+from types import SimpleNamespace
+
+import pytest
+import torch
+import triton
+
+from kgs.backends import gpu
+from kgs.backends.gpu import verdict
+
+CARD = torch.device("cuda", 0)
+
+
+@pytest.fixture(autouse=True)
+def card(monkeypatch, tmp_path):
+    """The properties of a card that is not there, and Triton's folder."""
+    found = SimpleNamespace(name="Card 9000")
+    module = SimpleNamespace(get_device_properties=lambda device: found)
+    monkeypatch.setattr(torch, "get_device_module", lambda device: module)
+    monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path / "cache"))
+    gpu.self_check.cache_clear()
+    yield found
+    gpu.self_check.cache_clear()
+
+
+def test_a_passed_check_is_known_from_then_on(tmp_path):
+    assert not verdict.is_kept(CARD)
+    verdict.keep(CARD)
+    assert verdict.is_kept(CARD)
+    assert verdict.is_kept(torch.device("cuda", 1))  # another card of that name
+    assert len(list(tmp_path.rglob("kgs_self_check.json"))) == 1
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda patch, card: setattr(card, "name", "Card 9001"),
+        lambda patch, card: setattr(card, "gcnArchName", "gfx942"),
+        lambda patch, card: setattr(card, "driver_version", "1.2"),
+        lambda patch, card: patch.setattr("platform.release", lambda: "7.0"),
+        lambda patch, card: patch.setattr(torch, "__version__", "99.0"),
+        lambda patch, card: patch.setattr(triton, "__version__", "99.0"),
+        lambda patch, card: patch.setattr(verdict, "__version__", "99.0"),
+        lambda patch, card: patch.setattr(verdict, "_source", lambda: "other"),
+    ],
+)
+def test_anything_else_is_checked_anew(change, card, monkeypatch):
+    verdict.keep(CARD)
+    change(monkeypatch, card)
+    assert not verdict.is_kept(CARD)
+    verdict.keep(CARD)
+    assert verdict.is_kept(CARD)
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[]", b"\xff\xfe", b'{"card": "Card 9000"}'])
+def test_a_damaged_file_is_checked_anew(content, tmp_path):
+    verdict.keep(CARD)
+    (file,) = tmp_path.rglob("kgs_self_check.json")
+    file.write_bytes(content)
+    assert not verdict.is_kept(CARD)
+    verdict.keep(CARD)
+    assert verdict.is_kept(CARD)
+
+
+def test_a_folder_that_cannot_be_written_is_no_error(tmp_path):
+    (tmp_path / "cache").write_text("a file")
+    verdict.keep(CARD)
+    assert not verdict.is_kept(CARD)
+
+
+def test_the_next_process_does_not_check_again(monkeypatch):
+    checks = []
+    monkeypatch.setattr("kgs.backends.agreement.disagreement", lambda *arguments: checks.append(1) or 1e-7)
+    assert gpu.self_check(CARD)
+    assert len(checks) == 2
+    gpu.self_check.cache_clear()  # as in another process
+    assert gpu.self_check(CARD)
+    assert len(checks) == 2
+
+
+def test_a_check_that_failed_is_done_again_in_the_next_process(monkeypatch):
+    found = [1.0, 1.0]
+    monkeypatch.setattr("kgs.backends.agreement.disagreement", lambda *arguments: found[-1])
+    with pytest.warns(UserWarning, match="differ from torch by 1"):
+        assert not gpu.self_check(CARD)
+    with warnings.catch_warnings():  # this process keeps to it
+        warnings.simplefilter("error")
+        assert not gpu.self_check(CARD)
+    gpu.self_check.cache_clear()
+    found.append(1e-7)
+    assert gpu.self_check(CARD)
