@@ -15,8 +15,7 @@ from torch import Tensor, nn
 
 from kgs._support.errors import ArgumentError
 
-from ._support.memory import empty
-from ._support.torch_threads import torch_on_all_threads
+from .backends import choose
 from .geometry import log_spacing
 from .harmonics import SH_C0
 from .types import SH_SIZES, Gaussians, check_tensor
@@ -152,18 +151,23 @@ class GaussianModel(nn.Module):
     def sh_degree(self, value: int) -> None:
         self._sh_degree = _check_degree(value, self.max_sh_degree)
 
-    def forward(self) -> Gaussians:
-        """The Gaussians: activated scales and opacities, and harmonics up to the active degree."""
-        colors: Tensor = self.sh_dc
-        if self.sh_degree > 0:  # at degree 0 sh_rest gets no gradient, and an optimiser skips it
-            colors = _JoinedBands.apply(self.sh_dc, self.sh_rest, SH_SIZES[self.sh_degree])
-        # A Gaussian whose scale overflows is not rendered. The gradient of exp would be 0 times infinity there.
-        too_large = self.log_scales >= math.log(torch.finfo(self.log_scales.dtype).max)
-        if self.log_scales.device.type == "cpu" and not torch.compiler.is_compiling() and not bool(too_large.any()):
-            scales = self.log_scales.exp()
-        else:  # on a GPU the answer would be waited for
-            scales = self.log_scales.masked_fill(too_large, 0.0).exp().masked_fill(too_large, math.inf)
-        return Gaussians(self.means, self.quats, scales, self.opacity_logits.sigmoid(), colors)
+    def forward(self, *, backend: str = "auto") -> Gaussians:
+        """The Gaussians: activated scales and opacities, and harmonics up to the active degree.
+
+        A Gaussian whose scale overflows has an infinite one, without gradient, and is not rendered.
+
+        Args:
+            backend: "auto", or the name of one, see `kgs.backends`. By "triton" differentiable once.
+
+        Raises:
+            ValueError: the backend does not exist, or does not cover a model of this dtype or device.
+            ModuleNotFoundError: the backend is numba or triton, and it is not installed.
+        """
+        chosen = choose(backend, "activation", self.means.device, lambda candidate: candidate.covers(self.means))
+        # at degree 0 sh_rest gets no gradient, and an optimiser skips it
+        parameters = (self.log_scales, self.opacity_logits, self.sh_dc, self.sh_rest)
+        scales, opacities, colors = chosen.activate(*parameters, SH_SIZES[self.sh_degree])
+        return Gaussians(self.means, self.quats, scales, opacities, colors)
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -198,30 +202,6 @@ class GaussianModel(nn.Module):
         antialiased = ", antialiased" if self.antialiased else ""
         degrees = f"sh_degree={self.sh_degree} of {self.max_sh_degree}"
         return f"{len(self)} Gaussians, {degrees}, {self.means.dtype}{antialiased}"
-
-
-class _JoinedBands(torch.autograd.Function):
-    """Concatenate `sh_dc` and the first bands of `sh_rest`, as `torch.cat` does, in buffers that are used again."""
-
-    @staticmethod
-    def forward(ctx: Any, sh_dc: Tensor, sh_rest: Tensor, bands: int) -> Tensor:
-        ctx.rest_shape = sh_rest.shape
-        ctx.bands = bands
-        joined = empty((len(sh_dc), bands, 3), sh_dc)
-        with torch_on_all_threads():
-            joined[:, :1] = sh_dc
-            joined[:, 1:] = sh_rest[:, : bands - 1]
-        return joined
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        grad_rest = None
-        if ctx.needs_input_grad[1]:
-            grad_rest = empty(ctx.rest_shape, grad)
-            with torch_on_all_threads():
-                grad_rest[:, : ctx.bands - 1] = grad[:, 1:]
-                grad_rest[:, ctx.bands - 1 :] = 0.0
-        return grad[:, :1], grad_rest, None
 
 
 def _check_degree(value: int, highest: int) -> int:

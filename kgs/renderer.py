@@ -10,8 +10,7 @@ from torch import Tensor, nn
 
 from kgs._support.errors import ArgumentError
 
-from ._support.memory import empty
-from .backends import check_backend
+from .backends import check_backend, choose
 from .camera import Cameras
 from .projection import normals
 from .stages import composite, project
@@ -121,14 +120,19 @@ class GaussianRenderer(nn.Module):
         values = torch.cat(list(features.values()), 1) if len(features) > 1 else projected.colors
         median = "median_depth" in outputs
         result = composite(projected, values, options=self.options, median_depth=median, backend=self.backend)
-        ends = accumulate((x.shape[1] for x in features.values()), initial=0)
-        images = {name: result.features[:, i:j] for name, (i, j) in zip(features, pairwise(ends), strict=True)}
+        images = {"image": result.features}
+        if len(features) > 1:
+            ends = accumulate((x.shape[1] for x in features.values()), initial=0)
+            images = {name: result.features[:, i:j] for name, (i, j) in zip(features, pairwise(ends), strict=True)}
         if "depth" in outputs:
             alpha = 1.0 - result.transmittance
             covered = alpha >= 1e-6
             images["depth"] = torch.where(covered, images["depth"] / torch.where(covered, alpha, 1.0), 0.0)
+        image = None
+        if with_image:
+            image = blend(images["image"], result.transmittance, background, self.backend)
         return Rendering(
-            image=blend(images["image"], result.transmittance, background) if with_image else None,
+            image=image,
             alpha=1.0 - result.transmittance if "alpha" in outputs else None,
             depth=images.get("depth"),
             median_depth=result.median_depth,
@@ -143,7 +147,9 @@ class GaussianRenderer(nn.Module):
         return ", ".join(texts)
 
 
-def blend(image: Tensor, transmittance: Tensor, background: Tensor | None, name: str = "background") -> Tensor:
+def blend(
+    image: Tensor, transmittance: Tensor, background: Tensor | None, backend: str, name: str = "background"
+) -> Tensor:
     """The image `(C, D, H, W)` over a background, seen through the transmittance `(C, 1, H, W)`."""
     if background is None:
         return image
@@ -154,32 +160,5 @@ def blend(image: Tensor, transmittance: Tensor, background: Tensor | None, name:
         background = background.reshape(*shape, 1, 1)
     elif shape not in (full[1:], full):
         raise ArgumentError(f"{name}: expected shape {full[1:2]}, {full[:2]}, {full[1:]} or {full}, got {shape}")
-    if background.device.type != "cpu" or bool(background.isinf().any()):  # elsewhere the answer would be waited for
-        # 0 where nothing shines through: 0 times an infinite background would be NaN
-        background = torch.where(background.isinf() & (transmittance == 0), 0.0, background)
-    one_color = background.ndim == 3 and background.shape[1:] == (1, 1)
-    if one_color and not background.requires_grad and not torch.compiler.is_compiling():
-        blended: Tensor = _OverColor.apply(image, transmittance, background[:, 0, 0])
-        return blended
-    return torch.addcmul(image, transmittance, background)
-
-
-class _OverColor(torch.autograd.Function):
-    """`addcmul` with one colour `(D,)`, with the same bits, in memory of `kgs._support.memory`."""
-
-    @staticmethod
-    def forward(ctx: Any, image: Tensor, transmittance: Tensor, color: Tensor) -> Tensor:
-        ctx.save_for_backward(color)
-        blended = empty(tuple(image.shape), image)
-        return torch.addcmul(image, transmittance, color[:, None, None], out=blended)
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        if torch.is_grad_enabled():
-            raise RuntimeError("background: expected backward without create_graph, there is no second derivative")
-        (color,) = ctx.saved_tensors
-        by_transmittance = None
-        if ctx.needs_input_grad[1]:
-            product = empty(tuple(grad.shape), grad)  # no matrix product: torch may round these
-            by_transmittance = torch.mul(grad, color[:, None, None], out=product).sum(1, keepdim=True)
-        return grad, by_transmittance, None
+    chosen = choose(backend, "blending", image.device, lambda candidate: candidate.covers(image))
+    return chosen.blend(image, transmittance, background)

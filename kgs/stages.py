@@ -173,13 +173,18 @@ def composite_call(
 
     chosen = choose(backend, "compositing", call.features.device, covers)
     tile_size = call.options.tile_size or chosen.tile_size
-    call = replace(call, options=replace(call.options, tile_size=tile_size))
+    call = replace(call, options=_with_tile_size(call.options, tile_size))
     projected = call.projected
     inputs = (projected.means2d, projected.factors, projected.opacities, call.features)
     keep = torch.is_grad_enabled() and any(x.requires_grad for x in inputs)
     hook = _setter(projected.means2d) if absgrad_hook is None else absgrad_hook
     sums, transmittance, median = _Composite.apply(*inputs, chosen.compositor(call), keep, hook)
     return Composited(sums, transmittance, median if call.median_depth else None, tile_size)
+
+
+@functools.lru_cache
+def _with_tile_size(options: RasterOptions, tile_size: int) -> RasterOptions:
+    return replace(options, tile_size=tile_size)
 
 
 def _setter(means2d: Tensor) -> Callable[[Tensor], None]:

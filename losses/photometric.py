@@ -185,23 +185,22 @@ def _torch_loss(
 
 
 class _PhotometricLoss(torch.autograd.Function):
-    """The loss by a backend that computes value and gradient in one pass."""
+    """The loss of a backend."""
 
     @staticmethod
     def forward(
         ctx: Any, image: Tensor, target: Tensor, mean: Tensor, variance: Tensor, weight: float, backend: Backend
     ) -> Tensor:
-        taps = window_taps(image.dtype)
-        loss, grad = backend.loss_and_gradient(image, target, mean, variance, taps, weight, ctx.needs_input_grad[0])
-        ctx.save_for_backward(grad)
-        return loss
+        ctx.settings = (window_taps(image.dtype), weight)
+        ctx.stage = backend.loss
+        loss, kept = ctx.stage.forward(image, target, mean, variance, *ctx.settings, ctx.needs_input_grad[0])
+        ctx.save_for_backward(*kept)
+        return loss  # type: ignore[no-any-return]
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None, None, None]:
         _refuse_second_derivative()
-        (by_image,) = ctx.saved_tensors
-        is_one = grad.device.type == "cpu" and float(grad) == 1.0  # `loss.backward()`
-        return by_image if is_one else grad * by_image, None, None, None, None, None
+        return ctx.stage.backward(ctx.saved_tensors, *ctx.settings, grad), None, None, None, None, None
 
 
 def _refuse_second_derivative() -> None:

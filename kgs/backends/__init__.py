@@ -87,10 +87,10 @@ def choose(name: str, stage: str, device: Device, covers: Callable[[Backend], bo
         ValueError: the backend does not exist, or it is named and does not cover the call.
         ModuleNotFoundError: it is named and not installed.
     """
-    check_backend(name)
     for backend in BACKENDS:
         if name in ("auto", backend.name) and covers(backend) and _may_take(backend, name, device):
             return backend
+    check_backend(name)
     raise ArgumentError(f'backend: {name!r} does not cover this call of {stage}, expected "auto" or "torch"')
 
 

@@ -48,8 +48,8 @@ FITS = (Step(absgrad=True), Step(bands=1), Step(bands=1, poses=True))  # of fits
 def disagreement(backend: Backend, device: torch.device, steps: tuple[Step, ...] = (EVERYTHING,)) -> float:
     """The largest difference from torch in float64, over the largest value of its kind.
 
-    Of training steps of 32 Gaussians, among them an opaque stack: images, the loss, and all gradients that are asked
-    for.
+    Of training steps of 32 Gaussians, among them an opaque stack: activations, images with and without a background,
+    the loss, all gradients that are asked for, and what an optimizer does with gradients.
 
     Args:
         backend: works in float32 on the device.
@@ -59,7 +59,7 @@ def disagreement(backend: Backend, device: torch.device, steps: tuple[Step, ...]
     backend.compile_ahead(lambda of_cpu: _run(backend, of_cpu, steps), device)
     reference_device = device if device.type in ("cpu", "cuda") else torch.device("cpu")
     found = _run(backend, device, steps)
-    exact = [value for step in steps for value in _render(TorchBackend(), reference_device, step)]
+    exact = _pictured(TorchBackend(), reference_device, steps)
     if backend.has_loss:
         exact += _exact_loss()
     if backend.has_optimizer:
@@ -69,11 +69,20 @@ def disagreement(backend: Backend, device: torch.device, steps: tuple[Step, ...]
 
 def _run(backend: Backend, device: torch.device, steps: tuple[Step, ...]) -> list[Tensor]:
     """What a backend finds."""
-    found = [value for step in steps for value in _render(backend, device, step)]
+    found = _pictured(backend, device, steps)
     if backend.has_loss:
         found += _loss(backend, device)
     if backend.has_optimizer:
         found += _optimized(backend, device)
+    return found
+
+
+def _pictured(backend: Backend, device: torch.device, steps: tuple[Step, ...]) -> list[Tensor]:
+    """What the stages of every backend find."""
+    found = _blend(backend, device)
+    for step in steps:
+        found += _activate(backend, device, step)
+        found += _render(backend, device, step)
     return found
 
 
@@ -84,9 +93,35 @@ def _random(*shape: int, low: float = -1.0, high: float = 1.0, seed: int = 0) ->
     return (unit * (high - low) + low).double()
 
 
+def _dtype(backend: Backend) -> torch.dtype:
+    """Float64 of torch, which defines what is right."""
+    return torch.float64 if isinstance(backend, TorchBackend) else torch.float32
+
+
+def _activate(backend: Backend, device: torch.device, step: Step) -> list[Tensor]:
+    """Scales, opacities and harmonics, and the gradients of what they are made of."""
+    rest = _random(8, step.bands - 1, 3, seed=1)
+    values = (_random(8, 3, low=-8.0), _random(8, low=-8.0, high=8.0), _random(8, 1, 3), rest)
+    leaves = [x.to(device, _dtype(backend)).requires_grad_() for x in values]
+    log_scales, opacity_logits, sh_dc, sh_rest = leaves
+    activated = backend.activate(log_scales, opacity_logits, sh_dc, sh_rest, step.bands)
+    weights = [_random(*x.shape, seed=2).to(x) for x in activated]
+    used = leaves if step.bands > 1 else leaves[:3]
+    return [*activated, *torch.autograd.grad(activated, used, weights)]
+
+
+def _blend(backend: Backend, device: torch.device) -> list[Tensor]:
+    """Images over a colour, and the gradients of images and transmittance."""
+    values = (_random(2, 5, 6, 7), _random(2, 1, 6, 7, low=0.0, seed=1))
+    leaves = [x.to(device, _dtype(backend)).requires_grad_() for x in values]
+    image, transmittance = leaves
+    blended = backend.blend(image, transmittance, _random(5, 1, 1).to(image))
+    return [blended, *torch.autograd.grad(blended, leaves, _random(2, 5, 6, 7, seed=2).to(blended))]
+
+
 def _render(backend: Backend, device: torch.device, step: Step) -> list[Tensor]:
-    """Images, once with what gradients need and once without, and gradients; float64 from torch, else float32."""
-    dtype = torch.float64 if isinstance(backend, TorchBackend) else torch.float32
+    """Images, once with what gradients need and once without, and gradients."""
+    dtype = _dtype(backend)
     n = 32
     width, height = 16, 12
     means = (_random(n, 3) + torch.tensor([0.0, 0.0, 3.0], device="cpu")).float()
@@ -133,9 +168,8 @@ def _loss(backend: Backend, device: torch.device) -> tuple[Tensor, Tensor]:
     x, y, mean, variance = (each.to(device, torch.float32) for each in (image, target, mean, square - mean * mean))
     window = get_gaussian_kernel1d(_WINDOW, _SIGMA, device=torch.device("cpu"), dtype=torch.float32)
     taps: list[float] = window.flatten().tolist()
-    loss, gradient = backend.loss_and_gradient(x, y, mean, variance, taps, _WEIGHT, True)
-    assert gradient is not None
-    return loss, gradient
+    loss, kept = backend.loss.forward(x, y, mean, variance, taps, _WEIGHT, True)
+    return loss, backend.loss.backward(kept, taps, _WEIGHT, torch.ones_like(loss))
 
 
 def _exact_loss() -> tuple[Tensor, Tensor]:

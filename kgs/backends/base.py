@@ -14,6 +14,18 @@ from kgs.camera import Cameras
 from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
 
 
+class ActivationStage(Protocol):
+    """The stage of :class:`kgs.GaussianModel`."""
+
+    def __call__(
+        self, log_scales: Tensor, opacity_logits: Tensor, sh_dc: Tensor, sh_rest: Tensor, bands: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Scales, infinite and without gradient where they overflow, opacities, and harmonics `(N, bands, 3)`.
+
+        With 1 band the latter are `sh_dc` itself; the gradient of `sh_rest` is 0 in bands that are not asked for.
+        """
+
+
 class ProjectionStage(Protocol):
     """The stage of :func:`kgs.project`."""
 
@@ -92,10 +104,25 @@ class Compositor(ABC):
         """
 
 
-class LossStage(Protocol):
-    """The stage of :func:`kgs.losses.photometric_loss`."""
+class BlendingStage(Protocol):
+    """The last stage of a render."""
 
-    def __call__(
+    def __call__(self, image: Tensor, transmittance: Tensor, background: Tensor) -> Tensor:
+        """The image `(C, D, H, W)` plus the transmittance `(C, 1, H, W)` times the background.
+
+        The background is `(D, 1, 1)`, or of any shape that can be expanded to the image's. Where the transmittance is
+        0 nothing is added, of an infinite background too.
+        """
+
+
+class LossStage(ABC):
+    """The stage of :func:`kgs.losses.photometric_loss`, forward and backward.
+
+    `kgs.losses.photometric` has all of it in torch, and wraps it in an autograd function.
+    """
+
+    @abstractmethod
+    def forward(
         self,
         image: Tensor,
         target: Tensor,
@@ -103,13 +130,17 @@ class LossStage(Protocol):
         variance: Tensor,
         taps: list[float],
         dssim_weight: float,
-        gradient: bool,
-    ) -> tuple[Tensor, Tensor | None]:
-        """L1 + `dssim_weight` (1 - SSIM), 0-d, and its gradient with respect to the image, or None if not wanted.
+        keep: bool,
+    ) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """L1 + `dssim_weight` (1 - SSIM), 0-d, and with `keep` what `backward` needs.
 
         Images are `(B, C, H, W)`, H and W at least the window; `mean` and `variance` `(1, B C, H, W)` those of the
-        target under the window with these taps. See `kgs.losses.photometric`, which has all of it in torch.
+        target under the window with these taps.
         """
+
+    @abstractmethod
+    def backward(self, kept: tuple[Tensor, ...], taps: list[float], dssim_weight: float, grad: Tensor) -> Tensor:
+        """From the gradient of the loss, 0-d, to that of the image; `kept` stays as it is."""
 
 
 class MomentsStage(Protocol):
@@ -162,7 +193,7 @@ class Backend(ABC):
         dtypes: of the tensors it works on.
         tile_size: side of its tiles in pixels, where `RasterOptions.tile_size` is None.
         package: what must be installed beside torch, and how to install it; None for nothing.
-        has_loss: whether it has `loss_and_gradient`.
+        has_loss: whether it has `loss`.
         has_moments: whether it has `local_moments`.
         has_optimizer: whether it has `optimizer`.
     """
@@ -209,6 +240,11 @@ class Backend(ABC):
 
     @property
     @abstractmethod
+    def activate(self) -> ActivationStage:
+        """Its activations."""
+
+    @property
+    @abstractmethod
     def project(self) -> ProjectionStage:
         """Its projection."""
 
@@ -218,7 +254,12 @@ class Backend(ABC):
         """Its compositing."""
 
     @property
-    def loss_and_gradient(self) -> LossStage:
+    @abstractmethod
+    def blend(self) -> BlendingStage:
+        """Its blending with a background."""
+
+    @property
+    def loss(self) -> LossStage:
         """Its photometric loss, where it has one."""
         raise NotImplementedError(f"{self.name} has no photometric loss")
 

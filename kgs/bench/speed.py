@@ -21,6 +21,7 @@ from kgs.fit.adam import Adam
 from kgs.losses import photometric_loss, target_moments
 from kgs.renderer import GaussianRenderer
 from kgs.stages import composite, project
+from kgs.types import Gaussians
 
 from .output import Row, markdown_table, write_plot, write_results
 from .scenes import PARAMETERS, layered_scene
@@ -146,14 +147,17 @@ class Cases:
         self.renderer.backend = backend
         case()
 
+    def _gaussians(self) -> Gaussians:
+        return self.model(backend=self.renderer.backend)  # type: ignore[no-any-return]
+
     @torch.no_grad()
     def forward(self) -> Any:
         """Render without gradient."""
-        return self.renderer(self.model(), self.camera).image
+        return self.renderer(self._gaussians(), self.camera).image
 
     def both(self, frozen: tuple[str, ...] = (), outputs: tuple[str, ...] = ("image",), **factors: Tensor) -> None:
         """Render, some of the Gaussians' tensors detached or multiplied, and go back to the model's parameters."""
-        gaussians = self.model()
+        gaussians = self._gaussians()
         changes = {name: getattr(gaussians, name).detach() for name in frozen}
         changes |= {name: getattr(gaussians, name) * factor for name, factor in factors.items()}
         rendering = self.renderer(replace(gaussians, **changes), self.camera, outputs=outputs)
@@ -163,7 +167,7 @@ class Cases:
 
     def train(self) -> None:
         """One step of training, densification left aside."""
-        image = self.renderer(self.model(), self.camera).image
+        image = self.renderer(self._gaussians(), self.camera).image
         backend = self.renderer.backend
         photometric_loss(image.clamp(0, 1), self.photo, 0.2, moments=self.moments, backend=backend).backward()
         self.optimizer.step()

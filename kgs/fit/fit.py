@@ -101,16 +101,17 @@ class Fit:
         background = self._background if gains is None else None
         outputs = ("image", *outputs) if gains is None else ("image", "alpha", *outputs)
         with threads_beside(self.backend):
-            rendering: Any = self._renderer(self.model(), camera, background, outputs=outputs)
+            rendering: Any = self._renderer(self.model(backend=self.backend), camera, background, outputs=outputs)
         if gains is None:
             return rendering.image, rendering
         exposed = rendering.image * gains.to(rendering.image)[:, None, None]
-        return blend(exposed, 1.0 - rendering.alpha, self._background), rendering
+        return blend(exposed, 1.0 - rendering.alpha, self._background, self.backend), rendering
 
     @torch.no_grad()
     def median_depth(self, camera: PinholeCamera) -> Tensor:
         """The median depth of the Gaussians from one camera, `(H, W)` on the CPU; 0 where there is nothing."""
-        rendering = self._renderer(self.model(), move_camera(camera, self.device), outputs=("median_depth",))
+        gaussians = self.model(backend=self.backend)
+        rendering = self._renderer(gaussians, move_camera(camera, self.device), outputs=("median_depth",))
         depth: Tensor = rendering.median_depth[0, 0].cpu()
         return depth
 

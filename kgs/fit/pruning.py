@@ -82,7 +82,7 @@ def contributions(model: GaussianModel, views: Views, options: RasterOptions, ba
     """
     renderer = GaussianRenderer(options=options, backend=backend).eval()
     with torch.no_grad():
-        gaussians = model()
+        gaussians = model(backend=backend)
     colors = torch.zeros_like(gaussians.means).requires_grad_()
     for i in range(len(views)):
         camera = move_camera(views.camera(i), colors.device)

@@ -317,7 +317,8 @@ class Trainer:
         if config.training_background == "random":
             background = torch.rand(3, generator=state.colors, dtype=torch.float32, device=self.plan.device)
             view = view.over_background(background, self.plan.backend)
-        rendering: Any = self.render_view(state.model(), camera, view.background_before_gain(background))
+        gaussians = state.model(backend=self.plan.backend)
+        rendering: Any = self.render_view(gaussians, camera, view.background_before_gain(background))
         if rendering.projected.means2d.requires_grad:
             rendering.projected.means2d.retain_grad()  # for the densifier
         loss = self.loss_of(view.as_photographed(rendering.image), view)

@@ -198,7 +198,7 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
     transmittance = joined([x.transmittance for x in composited])
     widths = [x.shape[1] for x in features.values()]
     sums = dict(zip(features, joined([x.features for x in composited]).split(widths, 1), strict=True))
-    images = _over(sums, transmittance, backgrounds, (*batch, count))
+    images = _over(sums, transmittance, backgrounds, (*batch, count), backend)
     alphas = 1.0 - transmittance
     if "depth" in sums:
         images["depth"] = sums["depth"] / alphas.clamp_min(1e-10) if render_mode.endswith("ED") else sums["depth"]
@@ -230,7 +230,7 @@ def _features(scene: Scene, projected: ProjectedGaussians, depth: bool, normal: 
 
 
 def _over(
-    sums: dict[str, Tensor], transmittance: Tensor, backgrounds: Tensor | None, batch: tuple[int, ...]
+    sums: dict[str, Tensor], transmittance: Tensor, backgrounds: Tensor | None, batch: tuple[int, ...], backend: str
 ) -> dict[str, Tensor]:
     """The image and the extra signals over their background; `batch` are the leading dimensions of `backgrounds`."""
     names = [name for name in ("image", "extra") if name in sums]
@@ -241,5 +241,5 @@ def _over(
     if tuple(backgrounds.shape) != (*batch, sum(widths)):
         raise ArgumentError(f"backgrounds: expected shape {(*batch, sum(widths))}, got {tuple(backgrounds.shape)}")
     behind = backgrounds.reshape(-1, sum(widths))
-    over = blend(torch.cat([sums[name] for name in names], 1), transmittance, behind, "backgrounds")
+    over = blend(torch.cat([sums[name] for name in names], 1), transmittance, behind, backend, "backgrounds")
     return dict(zip(names, over.split(widths, 1), strict=True))

@@ -90,7 +90,7 @@ def test_one_color_behind_an_image_is_added_as_torch_adds_it(rounding):
     image, transmittance = torch.rand(2, 3, 5, 7, requires_grad=True), torch.rand(2, 1, 5, 7, requires_grad=True)
     color = torch.rand(3)
     weights = torch.rand(2, 3, 5, 7)
-    found = blend(image, transmittance, color)
+    found = blend(image, transmittance, color, "torch")
     expected = torch.addcmul(image, transmittance, color[:, None, None])
     assert torch.equal(found, expected)
     with rounding:

@@ -6,6 +6,7 @@ python compiled_kernels.py build TARGET     without it: compile these from stdin
 
 import json
 import os
+import pkgutil
 import re
 import subprocess
 import sys
@@ -16,13 +17,14 @@ from pathlib import Path
 
 import torch
 
+from kgs.backends import gpu
+from kgs.backends.gpu import launch as gpu_launch
 from kgs.bench.scenes import layered_scene
 from kgs.bench.speed import Cases
 from kgs.camera import pinhole_cameras
 from kgs.densify import Densifier
 from kgs.renderer import GaussianRenderer
 
-STAGES = ("compositing", "projection", "loss", "optimizer")
 TARGETS = {
     "sm_75": ("cuda", 75, 32),
     "sm_80": ("cuda", 80, 32),
@@ -32,6 +34,13 @@ TARGETS = {
     "gfx1100": ("hip", "gfx1100", 32),
 }
 _TYPES = {"float32": "*fp32", "int64": "*i64", "int32": "*i32", "int16": "*i16", "int8": "*i8"}
+
+
+def stages():
+    """The modules that launch kernels."""
+    names = [module.name for module in pkgutil.iter_modules(gpu.__path__) if module.name != "launch"]
+    modules = [import_module(f"kgs.backends.gpu.{name}") for name in names]
+    return [module for module in modules if hasattr(module, "launch")]
 
 
 def recorded_kernels(every_form=False):
@@ -81,9 +90,8 @@ def _record(every_form):
         }
         interpret(kernel, grid, *arguments, warps=warps, **constants)
 
-    stages = [import_module(f"kgs.backends.gpu.{name}") for name in STAGES]
-    interpret = stages[0].launch
-    for stage in stages:
+    interpret = gpu_launch.launch
+    for stage in stages():
         stage.launch = launch
     cases = Cases(40, (16, 16), torch.device("cpu"), "triton")
     cases.train()
@@ -106,6 +114,9 @@ def _densify(cases):
 def _render_every_form():
     """Renders that a training step does not ask for."""
     model, camera = layered_scene(40, (24, 24))
+    for degree in range(4):
+        model.sh_degree = degree
+        sum(x.sum() for x in vars(model(backend="triton")).values()).backward()
     gaussians = model()
     leaves = {name: value.detach().requires_grad_() for name, value in vars(gaussians).items()}
     single = replace(gaussians, **leaves)
@@ -114,7 +125,7 @@ def _render_every_form():
     per_camera = replace(single, opacities=single.opacities.repeat(2, 1))
     for some, max_bytes in ((single, 2**17), (per_camera, 2**30)):
         renderer = GaussianRenderer(backend="triton", absgrad=True, max_bytes=max_bytes)
-        renderer(some, cameras, outputs=("image", "median_depth")).image.square().sum().backward()
+        renderer(some, cameras, torch.rand(3), ("image", "median_depth")).image.square().sum().backward()
     features = replace(single, colors=torch.rand(40, 9, requires_grad=True))
     GaussianRenderer(backend="triton")(features, cameras).image.square().sum().backward()
 

@@ -23,7 +23,16 @@ Rules that keep the kernels fast. Breaking any of them cost a measured factor of
 
 import torch
 
-from kgs.backends.base import Backend, CompositingCall, Compositor, LossStage, MomentsStage, ProjectionStage
+from kgs.backends.base import (
+    ActivationStage,
+    Backend,
+    BlendingStage,
+    CompositingCall,
+    Compositor,
+    LossStage,
+    MomentsStage,
+    ProjectionStage,
+)
 
 
 class CpuBackend(Backend):
@@ -44,6 +53,13 @@ class CpuBackend(Backend):
         return call.options.tile_size in (None, self.tile_size) and call.chunk_size is None and narrow and one_block
 
     @property
+    def activate(self) -> ActivationStage:
+        """See `Backend.activate`."""
+        from kgs.backends.torch.activation import activate
+
+        return activate
+
+    @property
     def project(self) -> ProjectionStage:
         """See `Backend.project`."""
         from .projection import project
@@ -58,11 +74,18 @@ class CpuBackend(Backend):
         return CpuCompositor
 
     @property
-    def loss_and_gradient(self) -> LossStage:
-        """See `Backend.loss_and_gradient`."""
-        from .loss import loss_and_gradient
+    def blend(self) -> BlendingStage:
+        """See `Backend.blend`."""
+        from kgs.backends.torch.blending import blend
 
-        return loss_and_gradient
+        return blend
+
+    @property
+    def loss(self) -> LossStage:
+        """See `Backend.loss`."""
+        from .loss import CpuLoss
+
+        return CpuLoss()
 
     @property
     def local_moments(self) -> MomentsStage:

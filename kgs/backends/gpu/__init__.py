@@ -1,8 +1,8 @@
 """The backend of Triton kernels, for float32 on GPUs.
 
-`projection_kernels`, `compositing_kernels`, `loss_kernels` and `optimizer_kernels` have the kernels of a stage, and
-`projection`, `compositing`, `loss` and `optimizer` bring them to torch; the other files of kernels are parts of these.
-`launch` calls them, `compiling` compiles them ahead, `verdict` keeps that they passed :func:`self_check`, and
+`activation`, `projection`, `compositing`, `blending`, `loss` and `optimizer` bring the kernels of a stage to torch,
+which stand in the file of kernels beside it; the other files of kernels are parts of these. `launch` calls them,
+`compiling` compiles them ahead, `verdict` keeps that they passed :func:`self_check`, and
 `entry_counts` tells compositing what projection has counted. Torch defines what is right; a kernel gives the same
 within the rounding of float32, and its formulas are explained in the torch code that it follows. `import kgs` does not
 import triton: a stage is imported when it is first used.
@@ -29,7 +29,16 @@ from contextlib import suppress
 import torch
 
 from kgs._support.errors import warn
-from kgs.backends.base import Backend, CompositingCall, Compositor, LossStage, OptimizerStages, ProjectionStage
+from kgs.backends.base import (
+    ActivationStage,
+    Backend,
+    BlendingStage,
+    CompositingCall,
+    Compositor,
+    LossStage,
+    OptimizerStages,
+    ProjectionStage,
+)
 
 
 class GpuBackend(Backend):
@@ -72,6 +81,13 @@ class GpuBackend(Backend):
         return call.options.tile_size in (None, self.tile_size) and call.chunk_size is None and one_block
 
     @property
+    def activate(self) -> ActivationStage:
+        """See `Backend.activate`."""
+        from .activation import activate
+
+        return activate
+
+    @property
     def project(self) -> ProjectionStage:
         """See `Backend.project`."""
         from .projection import project
@@ -86,11 +102,18 @@ class GpuBackend(Backend):
         return GpuCompositor
 
     @property
-    def loss_and_gradient(self) -> LossStage:
-        """See `Backend.loss_and_gradient`."""
-        from .loss import loss_and_gradient
+    def blend(self) -> BlendingStage:
+        """See `Backend.blend`."""
+        from .blending import blend
 
-        return loss_and_gradient
+        return blend
+
+    @property
+    def loss(self) -> LossStage:
+        """See `Backend.loss`."""
+        from .loss import GpuLoss
+
+        return GpuLoss()
 
     @property
     def optimizer(self) -> OptimizerStages:

@@ -175,8 +175,13 @@ def _not_specialized(kernel: Any) -> tuple[bool, ...]:
 
 
 def wide_sum(values: Tensor, dim: int) -> Tensor:
-    """The sum along a dimension in float64; in float32 on Intel's GPUs, some of which have no float64."""
-    return values.sum(dim, dtype=torch.float32 if values.device.type == "xpu" else torch.float64)
+    """The sum along a dimension in float64, in float32 where that may be missing."""
+    return values.sum(dim, dtype=torch.float64 if has_float64(values.device) else torch.float32)
+
+
+def has_float64(device: torch.device) -> bool:
+    """Whether numbers may be added up in float64; not on Intel's GPUs, some of which have none."""
+    return device.type != "xpu"
 
 
 def blocks(count: int, size: int) -> int:

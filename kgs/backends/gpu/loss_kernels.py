@@ -1,7 +1,7 @@
 """L1 + w (1 - SSIM) and its gradient, by the formulas of `kgs.losses.photometric`, a pixel for each lane.
 
-The window is separable, and so is its adjoint with the reflected border folded back: each of the four kernels goes over
-all pixels once, along rows or columns, and reads 11 neighbours. Arrays, K the channels of all pictures, H, W >= 11:
+The window is separable, and so is its adjoint with the reflected border folded back: each of four kernels goes over all
+pixels once, along rows or columns, and reads 11 neighbours. Arrays, K the channels of all pictures, H, W >= 11:
 
     image, target, mean_y, variance_y   (K, H, W), the latter two local moments of the target
     across                              (3, K, H, W), of x, x^2 and x y the sums along rows
@@ -121,6 +121,24 @@ def ssim_maps(
     tl.store(sums + blocks + tl.program_id(0), tl.sum(tl.where(inside, ssim, 0.0), 0))
 
 
+@triton.jit(do_not_specialize=["blocks", "pixels"])
+def add_up(sums, blocks, pixels, dssim_weight, loss, WIDE: tl.constexpr, BLOCK: tl.constexpr):
+    """The loss from the sums over blocks, in float64 with `WIDE`. One program."""
+    kind: tl.constexpr = tl.float64 if WIDE else tl.float32
+    i = tl.arange(0, BLOCK)
+    absolute = tl.zeros((BLOCK,), kind)
+    ssim = absolute
+    first = 0
+    while first < blocks:
+        inside = first + i < blocks
+        absolute += tl.load(sums + first + i, mask=inside, other=0.0).to(kind)
+        ssim += tl.load(sums + blocks + first + i, mask=inside, other=0.0).to(kind)
+        first += BLOCK
+    mean = tl.sum(ssim, 0) / pixels
+    mean = tl.where(mean > 1.0, 1.0, mean)  # what is not a number stays
+    tl.store(loss, (tl.sum(absolute, 0) / pixels + dssim_weight * (1.0 - mean)).to(tl.float32))
+
+
 @triton.jit(do_not_specialize=["pixels", "height", "width"])
 def fold_down(maps, pixels, height, width, t0, t1, t2, t3, t4, t5, down, BLOCK: tl.constexpr):
     """The adjoint of the window along columns, of one of the maps."""
@@ -134,9 +152,12 @@ def fold_down(maps, pixels, height, width, t0, t1, t2, t3, t4, t5, down, BLOCK: 
 
 @triton.jit(do_not_specialize=["pixels", "width"])
 def gradient_across(
-    image, target, pixels, width, t0, t1, t2, t3, t4, t5, down, by_ssim, by_l1, grad, BLOCK: tl.constexpr
+    image, target, pixels, width, t0, t1, t2, t3, t4, t5, down, by_ssim, by_l1, by_loss, grad, BLOCK: tl.constexpr
 ):  # fmt: skip
-    """The adjoint along rows, times what the maps multiply, scaled; and the gradient of the absolute difference."""
+    """The adjoint along rows, times what the maps multiply, and the gradient of the absolute difference.
+
+    Both are scaled, by numbers and by the gradient of the loss, which is read.
+    """
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = i < pixels
     column = i % width
@@ -147,4 +168,4 @@ def gradient_across(
     total += 2.0 * x * _folded(down, pixels + line, column, 1, width, inside, t0, t1, t2, t3, t4, t5)
     total += y * _folded(down, 2 * pixels + line, column, 1, width, inside, t0, t1, t2, t3, t4, t5)
     sign = tl.where(x > y, 1.0, 0.0) - tl.where(x < y, 1.0, 0.0)
-    tl.store(grad + i, by_ssim * total + by_l1 * sign, mask=inside)
+    tl.store(grad + i, (by_ssim * total + by_l1 * sign) * tl.load(by_loss), mask=inside)

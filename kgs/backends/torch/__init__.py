@@ -29,8 +29,10 @@ slices, nearest first, with lists only for tiles that are not yet opaque: hidden
 
 from torch import Tensor
 
-from kgs.backends.base import Backend, Compositor, ProjectionStage
+from kgs.backends.base import ActivationStage, Backend, BlendingStage, Compositor, ProjectionStage
 
+from .activation import activate
+from .blending import blend
 from .compositing import TorchCompositor
 from .projection import project
 
@@ -45,6 +47,11 @@ class TorchBackend(Backend):
         return True
 
     @property
+    def activate(self) -> ActivationStage:
+        """See `Backend.activate`."""
+        return activate
+
+    @property
     def project(self) -> ProjectionStage:
         """See `Backend.project`."""
         return project
@@ -53,3 +60,8 @@ class TorchBackend(Backend):
     def compositor(self) -> type[Compositor]:
         """See `Backend.compositor`."""
         return TorchCompositor
+
+    @property
+    def blend(self) -> BlendingStage:
+        """See `Backend.blend`."""
+        return blend
