@@ -48,8 +48,8 @@ FITS = (Step(absgrad=True), Step(bands=1), Step(bands=1, poses=True))  # of fits
 def disagreement(backend: Backend, device: torch.device, steps: tuple[Step, ...] = (EVERYTHING,)) -> float:
     """The largest difference from torch in float64, over the largest value of its kind.
 
-    Of training steps of 32 Gaussians, among them an opaque stack: activations, images, a background, the loss, and all
-    gradients that are asked for.
+    Of training steps of 32 Gaussians, among them an opaque stack: activations, images with and without a background,
+    the loss, all gradients that are asked for, and what an optimizer does with gradients.
 
     Args:
         backend: works in float32 on the device.
@@ -59,7 +59,7 @@ def disagreement(backend: Backend, device: torch.device, steps: tuple[Step, ...]
     backend.compile_ahead(lambda of_cpu: _run(backend, of_cpu, steps), device)
     reference_device = device if device.type in ("cpu", "cuda") else torch.device("cpu")
     found = _run(backend, device, steps)
-    exact = _by_stages(TorchBackend(), reference_device, steps)
+    exact = _pictured(TorchBackend(), reference_device, steps)
     if backend.has_loss:
         exact += _exact_loss()
     if backend.has_optimizer:
@@ -69,7 +69,7 @@ def disagreement(backend: Backend, device: torch.device, steps: tuple[Step, ...]
 
 def _run(backend: Backend, device: torch.device, steps: tuple[Step, ...]) -> list[Tensor]:
     """What a backend finds."""
-    found = _by_stages(backend, device, steps)
+    found = _pictured(backend, device, steps)
     if backend.has_loss:
         found += _loss(backend, device)
     if backend.has_optimizer:
@@ -77,11 +77,12 @@ def _run(backend: Backend, device: torch.device, steps: tuple[Step, ...]) -> lis
     return found
 
 
-def _by_stages(backend: Backend, device: torch.device, steps: tuple[Step, ...]) -> list[Tensor]:
-    """What the stages find that torch has, too; float64 from torch, else float32."""
+def _pictured(backend: Backend, device: torch.device, steps: tuple[Step, ...]) -> list[Tensor]:
+    """What the stages of every backend find."""
     found = _blend(backend, device)
     for step in steps:
-        found += [*_activate(backend, device, step), *_render(backend, device, step)]
+        found += _activate(backend, device, step)
+        found += _render(backend, device, step)
     return found
 
 
@@ -99,13 +100,14 @@ def _dtype(backend: Backend) -> torch.dtype:
 
 def _activate(backend: Backend, device: torch.device, step: Step) -> list[Tensor]:
     """Scales, opacities and harmonics, and the gradients of what they are made of."""
-    values = (_random(8, 3, low=-8.0), _random(8, low=-8.0, high=8.0), _random(8, 1, 3), _random(8, 15, 3, seed=1))
+    rest = _random(8, step.bands - 1, 3, seed=1)
+    values = (_random(8, 3, low=-8.0), _random(8, low=-8.0, high=8.0), _random(8, 1, 3), rest)
     leaves = [x.to(device, _dtype(backend)).requires_grad_() for x in values]
     log_scales, opacity_logits, sh_dc, sh_rest = leaves
     activated = backend.activate(log_scales, opacity_logits, sh_dc, sh_rest, step.bands)
     weights = [_random(*x.shape, seed=2).to(x) for x in activated]
-    varying = leaves if step.bands > 1 else leaves[:3]
-    return [*activated, *torch.autograd.grad(activated, varying, weights)]
+    used = leaves if step.bands > 1 else leaves[:3]
+    return [*activated, *torch.autograd.grad(activated, used, weights)]
 
 
 def _blend(backend: Backend, device: torch.device) -> list[Tensor]:

@@ -143,7 +143,7 @@ def test_kernels_that_fail_are_not_used_and_a_line_says_so(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.usefixtures("unchecked")
 def test_kernels_that_differ_are_not_used_and_a_line_says_so(monkeypatch):
-    monkeypatch.setattr(compositing, "FEATURES", 3)  # blocks of four overlap: what they say is added up twice
+    monkeypatch.setattr(compositing, "FEATURES", 2)  # blocks of four overlap: what they say is added up twice
     with pytest.warns(UserWarning, match=r"they differ from torch by .*, more than 5e-05"):
         assert not gpu.self_check(CPU)
 
