@@ -78,6 +78,7 @@ def test_savings_leave_the_image_alone():
         seen.append(gaussians)
         return renderer(gaussians, camera, **options)
 
+    recorder.backend = renderer.backend
     cases.renderer = recorder
     savings = cases.savings()
     for name in ("colours frozen", "geometry frozen"):

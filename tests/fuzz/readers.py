@@ -134,8 +134,8 @@ def _read_checkpoint(folder: Path) -> None:
     for name, value in trainer.model.state_dict().items():
         check_range(name, value, -3.5e38, 3.5e38)
     for parameter, state in trainer.state.optimizer.state.items():
-        for name, value in state.items():
-            check_range(name, value.expand(parameter.shape), -3.5e38, 3.5e38)
+        for name in ("exp_avg", "exp_avg_sq"):
+            check_range(name, state[name].expand(parameter.shape), -3.5e38, 3.5e38)
 
 
 def _read_config(folder: Path) -> None:
