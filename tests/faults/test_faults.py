@@ -141,7 +141,7 @@ def test_kill_9_of_each_command(
             (out / name).write_text("mine")
             process = start_command(*words)
             process.join(PATIENCE)
-            lost += process.exitcode != 2 or (out / name).read_text() != "mine"
+            lost += process.exitcode != 3 or (out / name).read_text() != "mine"
         shutil.rmtree(out)
     found = f"{lost} times a file of the user lost, or a result, or a folder left"
     record(f"kill -9 of kgs {command}", trials, lost, found, lost == 0)
