@@ -79,7 +79,7 @@ class GaussianRenderer(nn.Module):
         check_backend(backend)
         if opacity_layer is not None and not callable(opacity_layer):
             raise TypeError(f"opacity_layer: expected a module such as DropGaussian(p=0.2), got {opacity_layer!r}")
-        self.opacity_layer = nn.Identity() if opacity_layer is None else opacity_layer
+        self.opacity_layer: nn.Module = nn.Identity() if opacity_layer is None else opacity_layer
         self.options = raster_options(options, fields)
         self.backend = backend
 
