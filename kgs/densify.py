@@ -271,7 +271,8 @@ class Densifier:
             why = "the means need requires_grad=True, and the render has to be made with gradients on"
             raise ArgumentError(f"projected: expected means2d that require a gradient: {why}")
         name = "absgrad" if self.absgrad else "grad"
-        gradient: Tensor | None = getattr(means2d, name, None)
+        is_kept = self.absgrad or means2d.is_leaf or means2d.retains_grad  # torch warns where .grad is not kept
+        gradient: Tensor | None = getattr(means2d, name, None) if is_kept else None
         if gradient is None:
             order = "and observe comes after backward"
             why = "the render needs absgrad=True" if self.absgrad else "means2d.retain_grad() comes after the render"

@@ -39,7 +39,7 @@ class GaussianRenderer(nn.Module):
         fields: those of :class:`kgs.RasterOptions` as keyword arguments, in place of `options`.
 
     Raises:
-        TypeError: both `options` and fields of them are given, or a field does not exist.
+        TypeError: both `options` and fields of them are given, a field does not exist, or the layer cannot be called.
         ValueError: an option is out of range, or the backend does not exist.
         ModuleNotFoundError: the backend is numba or triton, and it is not installed.
 
@@ -77,7 +77,9 @@ class GaussianRenderer(nn.Module):
     ) -> None:
         super().__init__()
         check_backend(backend)
-        self.opacity_layer = nn.Identity() if opacity_layer is None else opacity_layer
+        if opacity_layer is not None and not callable(opacity_layer):
+            raise TypeError(f"opacity_layer: expected a module such as DropGaussian(p=0.2), got {opacity_layer!r}")
+        self.opacity_layer: nn.Module = nn.Identity() if opacity_layer is None else opacity_layer
         self.options = raster_options(options, fields)
         self.backend = backend
 

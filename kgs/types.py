@@ -11,7 +11,7 @@ from numbers import Integral, Real
 from typing import Any, Self
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from kgs._support.errors import ArgumentError
 
@@ -163,7 +163,8 @@ class Gaussians:
         for name, width in (("means", 3), ("quats", 4), ("scales", 3)):
             got = tuple(getattr(self, name).shape)
             if got != (n, width) and (name, got) != ("quats", (n, 3, 3)):
-                raise ArgumentError(f"{name}: expected shape {(n, width)}, got {got}")
+                rows = "N" if name == "means" else n
+                raise ArgumentError(f"{name}: expected shape ({rows}, {width}), got {got}")
         if self.opacities.ndim not in (1, 2) or self.opacities.shape[-1] != n:
             raise ArgumentError(f"opacities: expected shape ({n},) or (C, {n}), got {tuple(self.opacities.shape)}")
         shape = tuple(self.colors.shape)
@@ -304,4 +305,5 @@ def check_intrinsic_rows(name: str, matrices: list[list[list[float]]]) -> None:
 def check_kind(name: str, value: Any, kind: type) -> None:
     """Raise a TypeError where the argument is of another type, for instance a model instead of its Gaussians."""
     if not isinstance(value, kind):
-        raise TypeError(f"{name}: expected {kind.__name__}, got {type(value).__name__}")
+        hint = "; call the module and pass the result" if isinstance(value, nn.Module) else ""
+        raise TypeError(f"{name}: expected {kind.__name__}, got {type(value).__name__}{hint}")

@@ -322,6 +322,6 @@ def _check_images(image: Tensor, target: Tensor) -> None:
         expected = f"{image.dtype} on {image.device}"
         raise TypeError(f"target: expected {expected} as image, got {target.dtype} on {target.device}")
     if image.ndim != 4 or image.numel() == 0:
-        raise ArgumentError(f"image: expected shape (B, C, H, W) without a zero, got {tuple(image.shape)}")
+        raise ArgumentError(f"image: expected shape (B, C, H, W), each at least 1, got {tuple(image.shape)}")
     if target.shape != image.shape:
         raise ArgumentError(f"target: expected shape {tuple(image.shape)} as image, got {tuple(target.shape)}")

@@ -18,10 +18,12 @@ EXTRAS = {
 def missing(package: str) -> str:
     """What to do about a package that is not installed."""
     extra = EXTRAS.get(package.partition(".")[0], "app")
-    return (
-        f'{package} is missing: run pip install -e ".[{extra}]" in a clone of kgs, '
-        f'or pip install "kgs-splat[{extra}]" where an index has it'
-    )
+    return f"{package} is missing: run {installing(extra)}"
+
+
+def installing(extra: str) -> str:
+    """The commands that install an extra."""
+    return f'pip install -e ".[{extra}]" in a clone of kgs, or pip install "kgs-splat[{extra}]" where an index has it'
 
 
 def check_opencv() -> None:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 
 from kgs import backends
+from kgs._support.extras import installing
 from kgs._support.machine import check_device, versions
 from kgs.backends import Backend
 from kgs.backends.agreement import BOUND, disagreement
@@ -68,7 +69,7 @@ def check(*, device: str | None = None) -> int:
     print(f"10 000, 50 000: Gaussians; a training step at {SIZE[1]}x{SIZE[0]} without densification")
     missing = {extra: of for extra, of in _EXTRAS.items() if find_spec(of[0]) is None}
     for extra, (_, use) in missing.items():
-        print(f'not installed: {use} (pip install "kgs-splat[{extra}]")')
+        print(f"not installed: {use} ({installing(extra)})")
     return 1 if faults else 0
 
 

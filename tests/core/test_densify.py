@@ -1,5 +1,6 @@
 """Clone, split and prune: which Gaussians, how many, and where the children are."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -146,6 +147,15 @@ def test_the_cap_takes_the_largest_gradients_and_ties_by_position():
     densifier.observe(seen(model, [0, 1, 2, 3, 4], [(1, 0), (3, 0), (1, 0), (2, 0), (1, 0)]))
     assert densifier.step() == DensifyReport(cloned=3, split=0, pruned=0, total=9, capped=2)
     assert torch.equal(model.means[6:], means[[0, 1, 3]])
+
+
+@pytest.mark.filterwarnings("error")  # torch's warning about .grad would hide the message
+def test_a_forgotten_retain_grad_is_one_error_and_no_warning():
+    model, _, densifier = make([SMALL])
+    projected = seen(model, [0], [(0, 0)])
+    projected = dataclasses.replace(projected, means2d=projected.means2d.detach().requires_grad_() * 1.0)
+    with pytest.raises(ValueError, match="retain_grad"):
+        densifier.observe(projected)
 
 
 @pytest.mark.parametrize("log_scale", [-100.0, -44.0, 44.0, 88.0, 89.0, 1000.0])

@@ -192,6 +192,7 @@ CASES = [
     ("options", TypeError, lambda: kgs.project(random_gaussians(3, 0), camera(), options={"eps2d": 0.1})),
     bad_stage("options", TypeError, options={"eps2d": 0.1}),
     # the renderer
+    ("opacity_layer", TypeError, lambda: kgs.GaussianRenderer(opacity_layer=0.2)),
     *(bad_argument("outputs", ValueError, value) for value in (("imag",), (), "image")),
     *(bad_argument("background", ValueError, torch.zeros(shape)) for shape in ((4,), (2, 3), (1, 3, 12, 9))),
     bad_argument("background", TypeError, torch.zeros(3).double()),
@@ -343,3 +344,13 @@ CASES = [
 def test_what_is_wrong_is_named(name, error, call):
     with pytest.raises(error, match=f"^{re.escape(name)}:"):
         call()
+
+
+def test_a_model_in_place_of_its_gaussians_is_told_to_be_called():
+    with pytest.raises(TypeError, match="expected Gaussians, got GaussianModel; call the module"):
+        kgs.GaussianRenderer()(random_model(3), camera())
+
+
+def test_means_of_another_shape_are_not_told_their_own_count():
+    with pytest.raises(ValueError, match=re.escape("means: expected shape (N, 3), got (3, 7)")):
+        with_fields(random_gaussians(7, 0), means=torch.zeros(3, 7, dtype=torch.float64))

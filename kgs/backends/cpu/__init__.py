@@ -23,6 +23,7 @@ Rules that keep the kernels fast. Breaking any of them cost a measured factor of
 
 import torch
 
+from kgs._support.extras import installing
 from kgs.backends.base import (
     ActivationStage,
     Backend,
@@ -42,7 +43,7 @@ class CpuBackend(Backend):
     devices = ("cpu",)
     dtypes = (torch.float32,)
     tile_size = 8  # a constant of the kernels
-    package = ("numba", 'run pip install "kgs-splat[fast]"')
+    package = ("numba", f"run {installing('fast')}")
     has_loss = True
     has_moments = True
 
