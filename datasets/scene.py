@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from kgs._support.errors import ArgumentError, DataError
+from kgs._support.shown import ShownByShapes
 
 
 def pinholes(intrinsics: Tensor, extrinsics: Tensor, size: tuple[int, int]) -> PinholeCamera:
@@ -19,8 +20,8 @@ def pinholes(intrinsics: Tensor, extrinsics: Tensor, size: tuple[int, int]) -> P
     return PinholeCamera(intrinsics, extrinsics, *(intrinsics.new_full((len(intrinsics),), float(s)) for s in size))
 
 
-@dataclass(frozen=True, eq=False)
-class Views:
+@dataclass(frozen=True, eq=False, repr=False)
+class Views(ShownByShapes):
     """V posed images of one size: a data set of dicts, `views[0]["image"]`.
 
     Convention:
@@ -214,8 +215,8 @@ class Views:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Scene:
+@dataclass(frozen=True, eq=False, repr=False)
+class Scene(ShownByShapes):
     """Training and test views in one world frame, with initial points if the layout has any.
 
     Args:

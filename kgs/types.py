@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from kgs._support.errors import ArgumentError
+from kgs._support.shown import ShownByShapes
 
 from .covariance import conics, variances
 
@@ -126,8 +127,8 @@ def raster_options(options: RasterOptions | None, fields: Mapping[str, Any]) -> 
     return options
 
 
-@dataclass(frozen=True, eq=False)
-class Gaussians:
+@dataclass(frozen=True, eq=False, repr=False)
+class Gaussians(ShownByShapes):
     """A set of N Gaussians with activated values: the input of the renderer.
 
     Convention:
@@ -191,8 +192,8 @@ class Gaussians:
         return replace(self, **{name: value.to(*args, **kwargs) for name, value in vars(self).items()})
 
 
-@dataclass(frozen=True, eq=False)
-class ProjectedGaussians:
+@dataclass(frozen=True, eq=False, repr=False)
+class ProjectedGaussians(ShownByShapes):
     """The M pairs (camera, Gaussian) where the Gaussian lies beyond the near plane and touches the image.
 
     A Gaussian is listed whatever its opacity, even if `DropGaussian` set it to 0 (it is then not composited).
@@ -242,8 +243,8 @@ class ProjectedGaussians:
         return self.camera_ids.shape[0]
 
 
-@dataclass(frozen=True, eq=False)
-class Composited:
+@dataclass(frozen=True, eq=False, repr=False)
+class Composited(ShownByShapes):
     """Sums over the Gaussians of each pixel, before background and normalisation."""
 
     features: Tensor  # sum of w times features, (C, F, H, W)
@@ -252,8 +253,8 @@ class Composited:
     tile_size: int  # side of the tiles that were used, in pixels
 
 
-@dataclass(frozen=True, eq=False)
-class Rendering:
+@dataclass(frozen=True, eq=False, repr=False)
+class Rendering(ShownByShapes):
     """What a render call returns; a field that was not requested is None and was not computed.
 
     Args:

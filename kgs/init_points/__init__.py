@@ -10,6 +10,7 @@ from torch import Tensor
 from kgs._support.errors import ArgumentError, warn
 from kgs._support.machine import check_device
 from kgs._support.progress import ProgressBar, silent
+from kgs._support.shown import ShownByShapes
 from kgs.datasets.scene import Views
 from kgs.geometry import ViewGeometry
 from kgs.types import check_kind
@@ -27,8 +28,8 @@ DRAWS = ("uniform", "spread")
 MIN_DENSE = 1000
 
 
-@dataclass(frozen=True)
-class InitialPoints:
+@dataclass(frozen=True, repr=False)
+class InitialPoints(ShownByShapes):
     """The points that a fit starts from, with their colours.
 
     Args:

@@ -144,3 +144,8 @@ def test_every_default_is_that_of_the_options(function):
     shared = parameters.keys() & expected.keys()
     assert len(shared) > 3
     assert {name: parameters[name].default for name in shared} == {name: expected[name] for name in shared}
+
+
+def test_print_shows_shapes_and_no_numbers():
+    shapes = "means=(5, 3), quats=(5, 4), scales=(5, 3), opacities=(5,), colors=(5, 4, 3)"
+    assert repr(Gaussians(**fields())) == f"Gaussians({shapes})"
