@@ -28,7 +28,7 @@ from contextlib import suppress
 
 import torch
 
-from kgs._support.errors import warn
+from kgs._support.errors import cause_of, warn
 from kgs.backends.base import (
     ActivationStage,
     Backend,
@@ -144,12 +144,11 @@ def self_check(device: torch.device) -> bool:
     if verdict.is_kept(device):
         return True
     try:  # twice: from their second call on kernels are launched in another way, see `.launch`
-        differences = [disagreement(GpuBackend(), device, FITS) for _ in range(2)]
-        difference = float(torch.tensor(differences, device="cpu").max())  # NaN stays
+        difference = max(disagreement(GpuBackend(), device, FITS) for _ in range(2))
     except torch.OutOfMemoryError:
         raise
     except Exception as error:  # a compiler that does not know the card, a driver: kgs can do without
-        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+        reason = cause_of(error)
     else:
         if difference <= BOUND:
             verdict.keep(device)
