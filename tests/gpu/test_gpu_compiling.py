@@ -138,8 +138,10 @@ def test_the_log_says_how_far_it_is(monkeypatch, caplog):
     assert not caplog.messages
 
 
-def test_what_goes_wrong_meanwhile_is_no_error(monkeypatch):
+def test_what_goes_wrong_meanwhile_is_no_error(monkeypatch, caplog):
     monkeypatch.setattr("kgs.backends.gpu._is_interpreted", lambda: False)
     devices = []
-    GpuBackend().compile_ahead(lambda device: devices.append(device) or 1 / 0, torch.device("cuda", 0))
+    with caplog.at_level(logging.DEBUG, "kgs"):
+        GpuBackend().compile_ahead(lambda device: devices.append(device) or 1 / 0, torch.device("cuda", 0))
     assert devices == [CPU]
+    assert "ZeroDivisionError" in caplog.text

@@ -22,9 +22,9 @@ Rules:
 """
 
 import functools
+import logging
 import os
 from collections.abc import Callable
-from contextlib import suppress
 
 import torch
 
@@ -39,6 +39,8 @@ from kgs.backends.base import (
     OptimizerStages,
     ProjectionStage,
 )
+
+_log = logging.getLogger("kgs")
 
 
 class GpuBackend(Backend):
@@ -72,8 +74,10 @@ class GpuBackend(Backend):
             return
         from .compiling import compile_together, needed_launches
 
-        with suppress(Exception):  # whatever is wrong is met again when it is launched
+        try:
             compile_together(needed_launches(lambda: run(torch.device("cpu"))), device)
+        except Exception:  # whatever is wrong is met again when it is launched
+            _log.debug("kernels are compiled one after another", exc_info=True)
 
     def covers_compositing(self, call: CompositingCall) -> bool:
         """Only its own tile size, no `chunk_size`, and of many features no `absgrad`: blocks would be added up."""
