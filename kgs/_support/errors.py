@@ -5,6 +5,8 @@ import warnings
 from collections.abc import Sequence
 from os import PathLike
 
+_END = 160  # letters of each end of a long text
+
 
 def printable(text: object) -> str:
     """Text as one line of a message: control characters, as file names may have, are escaped."""
@@ -16,6 +18,14 @@ def listed(names: Sequence[object], max_names: int = 3) -> str:
     more = len(names) - max_names
     text = ", ".join(printable(name) for name in names[:max_names])
     return f"{text} and {more} more" if more > 0 else text
+
+
+def cause_of(error: BaseException) -> str:
+    """In one line what an error was first caused by; of a long text, as compilers write it, the two ends."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    text = printable(" ".join(f"{type(error).__name__}: {error}".split()))
+    return text if len(text) <= 2 * _END else f"{text[:_END]} ... {text[-_END:]}"
 
 
 def quantity(number: int, noun: str) -> str:

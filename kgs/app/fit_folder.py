@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 from kgs._support.errors import DataError, printable
 from kgs._support.json_files import write_json
 from kgs._support.machine import check_packages
-from kgs.app.console import each, progress, say
 from kgs.app.files.cameras import as_taken
 from kgs.app.files.figures import write_curve
 from kgs.app.files.locks import locked
@@ -27,7 +26,6 @@ from kgs.app.files.results_folder import (
     is_finished,
     step_of,
 )
-from kgs.app.live import LivePage
 from kgs.app.page.fit_page import PAGE, write_own_page
 from kgs.datasets.scene import Scene
 from kgs.fit.checkpoint import save_checkpoint
@@ -41,7 +39,9 @@ from kgs.fit.trainer import Trainer
 from kgs.metrics.lpips import Lpips
 from kgs.ply import save_ply
 
+from .console import each, progress, say
 from .files.exports import write_exports
+from .live import LivePage
 from .scene_request import SceneRequest
 from .stages import Stages
 

@@ -5,8 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from kgs.app.console import each
-from kgs.app.fit_folder import train
 from kgs.datasets.source import SceneSource
 from kgs.fit.config import FitConfig
 from kgs.fit.measures import measure
@@ -15,6 +13,8 @@ from kgs.fit.run import choose_points, decide
 from kgs.fit.trainer import Trainer
 from kgs.metrics.lpips import Lpips
 
+from .console import each
+from .fit_folder import train
 from .scene_request import SceneRequest
 
 MIN_PHOTOS = 4  # three to fit, and one to measure

@@ -8,9 +8,11 @@ answer.
 """
 
 import json
+import logging
 import re
 import secrets
 import socketserver
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -36,6 +38,7 @@ _HEADERS = {
     "X-Content-Type-Options": "nosniff",
 }
 T = TypeVar("T")
+_log = logging.getLogger("kgs")
 
 
 class LiveServer:
@@ -161,7 +164,9 @@ class _Server(socketserver.ThreadingTCPServer):
     daemon_threads = True
 
     def handle_error(self, *_: object) -> None:
-        """Say nothing: a page was closed while it was sent, or its connection was idle."""
+        """Say nothing of a page that was closed while it was sent, or was idle; keep other errors for who debugs."""
+        if not isinstance(sys.exception(), OSError):
+            _log.debug("the live page was not answered", exc_info=True)
 
 
 class _Handler(BaseHTTPRequestHandler):

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 
 from kgs import backends
+from kgs._support.errors import cause_of
 from kgs._support.extras import installing
 from kgs._support.machine import check_device, versions
 from kgs.backends import Backend
@@ -106,7 +107,7 @@ def _examine(backend: Backend, device: torch.device) -> _Result:
             off = max(off, disagreement(backend, device))
         milliseconds = [1e3 * _seconds(count, backend.name, device) for count in COUNTS]
     except Exception as error:  # whatever a compiler, a driver or a broken package does
-        return _Result(float("nan"), [], f"{type(error).__name__}: {error}".splitlines()[0])
+        return _Result(float("nan"), [], cause_of(error))
     wrong = "" if off <= BOUND else f"expected at most {BOUND:g}"
     return _Result(off, milliseconds, wrong)
 

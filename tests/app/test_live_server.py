@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import socket
 import sys
 import time
@@ -174,6 +175,16 @@ def test_it_says_nothing(server: LiveServer, capfd: Any) -> None:
     server.close("over")
     said = capfd.readouterr()
     assert (said.out, said.err) == ("", "")
+
+
+def test_an_error_in_making_a_splat_is_logged_and_the_server_goes_on(server: LiveServer, caplog: Any) -> None:
+    server.show("step 1", lambda: Packed({}, bytes(1 // 0)))
+    with caplog.at_level(logging.DEBUG, "kgs"):
+        with pytest.raises(IndexError):
+            ask(server, "GET /splat?after=1")  # closed without an answer
+        assert ask(server)[0] == 200
+        server.close("over")
+    assert "ZeroDivisionError" in caplog.text
 
 
 def test_the_end_is_told_to_who_waits_and_then_the_port_is_closed(server: LiveServer) -> None:

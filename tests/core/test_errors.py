@@ -27,6 +27,7 @@ from kornia.sensors.camera import CameraModelType
 
 import kgs
 import kgs.reference
+from kgs._support.errors import cause_of
 from kgs.camera import image_size
 from kgs.compressed_ply import save_compressed_ply
 from kgs.densify import Densifier
@@ -354,3 +355,14 @@ def test_a_model_in_place_of_its_gaussians_is_told_to_be_called():
 def test_means_of_another_shape_are_not_told_their_own_count():
     with pytest.raises(ValueError, match=re.escape("means: expected shape (N, 3), got (3, 7)")):
         with_fields(random_gaussians(7, 0), means=torch.zeros(3, 7, dtype=torch.float64))
+
+
+def test_the_first_cause_of_an_error_is_a_line():
+    first = OSError("no\n  compiler\x1b\n")
+    for error in (RuntimeError("at 3:4:\n    x = y\n"), ValueError("")):
+        error.__cause__ = first
+        first = error
+    assert cause_of(first) == "OSError: no compiler\\x1b"
+    long = cause_of(RuntimeError(f"at 3:4:\n{'x = y' * 1000}\nunknown name y"))
+    assert re.fullmatch(r"RuntimeError: at 3:4: .* \.\.\. .*unknown name y", long)
+    assert len(long) < 400

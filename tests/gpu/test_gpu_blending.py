@@ -38,6 +38,11 @@ def test_a_color_for_each_image(channels, count):
     assert_alike(torch.rand(count, channels, 1, 1), channels, count)
 
 
+@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 3, 1, 1), (2, 1, 1, 1), (1, 1)])
+def test_a_background_that_is_expanded(shape):
+    assert_alike(torch.full(shape, 0.7), 3, 2)
+
+
 def test_other_backgrounds_and_their_gradient_by_torch():
     assert_alike(torch.rand(3, *SIZE), 3, 2)
     color = torch.rand(3, 1, 1, requires_grad=True)

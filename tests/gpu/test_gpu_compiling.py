@@ -44,7 +44,7 @@ def test_a_training_step_needs_no_kernel_that_the_check_does_not():
     """Whatever the number of Gaussians and the size of the image, divisible by 16 or not."""
     checked = forms(lambda: agreement._run(GpuBackend(), CPU, agreement.FITS))
     names = {name for name, _ in checked.values()}
-    assert len(names) >= 18
+    assert len(names) >= 26
     assert len(checked) <= len(names) + 8
     runs = [
         cases((24, 32), 100).train,
@@ -138,6 +138,10 @@ def test_the_log_says_how_far_it_is(monkeypatch, caplog):
     assert not caplog.messages
 
 
-def test_what_goes_wrong_meanwhile_is_no_error(monkeypatch):
+def test_what_goes_wrong_meanwhile_is_no_error(monkeypatch, caplog):
     monkeypatch.setattr("kgs.backends.gpu._is_interpreted", lambda: False)
-    GpuBackend().compile_ahead(lambda _: 1 / 0, CPU)
+    devices = []
+    with caplog.at_level(logging.DEBUG, "kgs"):
+        GpuBackend().compile_ahead(lambda device: devices.append(device) or 1 / 0, torch.device("cuda", 0))
+    assert devices == [CPU]
+    assert "ZeroDivisionError" in caplog.text

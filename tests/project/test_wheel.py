@@ -75,6 +75,7 @@ def test_what_an_index_shows_of_it(wheel):
         (name,) = [name for name in archive.namelist() if name.endswith(".dist-info/METADATA")]
         metadata = email.message_from_string(archive.read(name).decode())
     assert (metadata["Name"], metadata["License-Expression"] or metadata["License"]) == ("kgs-splat", "Apache-2.0")
+    assert metadata.get_all("License-File") == ["LICENSE", "kgs/app/demo_photos/LICENSE"]  # MIT, of the photos
     assert metadata["Requires-Python"] == ">=3.11"
     assert metadata["Description-Content-Type"].startswith("text/markdown")
     assert metadata.get_payload().strip() == (ROOT / "README.md").read_text(encoding="utf-8").strip()

@@ -52,4 +52,4 @@ def poses(
     for note in notes_on_photos(photos, masks):
         say(note)
     pose_photos(photos, out, seed=seed, masks=masks, frames=frames, bar=each, say=say)
-    say_next(as_line("kgs", "fit", out, "-o", f"{out.resolve().name}-fit"))
+    say_next(as_line("kgs", "fit", out, "-o", Path(f"{out.resolve().name}-fit")))

@@ -22,13 +22,13 @@ Rules:
 """
 
 import functools
+import logging
 import os
 from collections.abc import Callable
-from contextlib import suppress
 
 import torch
 
-from kgs._support.errors import warn
+from kgs._support.errors import cause_of, warn
 from kgs.backends.base import (
     ActivationStage,
     Backend,
@@ -39,6 +39,8 @@ from kgs.backends.base import (
     OptimizerStages,
     ProjectionStage,
 )
+
+_log = logging.getLogger("kgs")
 
 
 class GpuBackend(Backend):
@@ -72,8 +74,10 @@ class GpuBackend(Backend):
             return
         from .compiling import compile_together, needed_launches
 
-        with suppress(Exception):  # whatever is wrong is met again when it is launched
+        try:
             compile_together(needed_launches(lambda: run(torch.device("cpu"))), device)
+        except Exception:  # whatever is wrong is met again when it is launched
+            _log.debug("kernels are compiled one after another", exc_info=True)
 
     def covers_compositing(self, call: CompositingCall) -> bool:
         """Only its own tile size, no `chunk_size`, and of many features no `absgrad`: blocks would be added up."""
@@ -144,12 +148,11 @@ def self_check(device: torch.device) -> bool:
     if verdict.is_kept(device):
         return True
     try:  # twice: from their second call on kernels are launched in another way, see `.launch`
-        differences = [disagreement(GpuBackend(), device, FITS) for _ in range(2)]
-        difference = float(torch.tensor(differences, device="cpu").max())  # NaN stays
+        difference = max(disagreement(GpuBackend(), device, FITS) for _ in range(2))
     except torch.OutOfMemoryError:
         raise
     except Exception as error:  # a compiler that does not know the card, a driver: kgs can do without
-        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+        reason = cause_of(error)
     else:
         if difference <= BOUND:
             verdict.keep(device)

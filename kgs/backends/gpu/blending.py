@@ -15,7 +15,8 @@ _BLOCK = 256  # pixels of a program
 
 def blend(image: Tensor, transmittance: Tensor, background: Tensor) -> Tensor:
     """See `BlendingStage`."""
-    if background.shape[-2:] != (1, 1) or background.requires_grad:
+    color = (image.shape[1], 1, 1)
+    if tuple(background.shape) not in (color, (len(image), *color)) or background.requires_grad:
         return blend_in_torch(image, transmittance, background)
     blended: Tensor = _OverColor.apply(image, transmittance, background)
     return blended

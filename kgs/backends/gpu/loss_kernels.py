@@ -8,6 +8,8 @@ pixels once, along rows or columns, and reads 11 neighbours. Arrays, K the chann
     maps                                (3, K, H, W), derivatives of the SSIM by local mean, square and product
     sums                                (2, blocks), of the absolute difference and of the SSIM
     down                                (3, K, H, W), of the maps the adjoint along columns
+
+`pixels`, K H W, is added twice: from 2^30 on 2 `pixels` would not fit into its 32 bits.
 """
 
 import triton
@@ -80,7 +82,7 @@ def sum_across(image, target, pixels, width, t0, t1, t2, t3, t4, t5, across, BLO
         product += weight * (x * y)
     tl.store(across + i, mean, mask=inside)
     tl.store(across + pixels + i, square, mask=inside)
-    tl.store(across + 2 * pixels + i, product, mask=inside)
+    tl.store(across + pixels + pixels + i, product, mask=inside)
 
 
 @triton.jit(do_not_specialize=["pixels", "height", "width", "blocks"])
@@ -102,7 +104,7 @@ def ssim_maps(
         at = across + top + _mirror(row + j - RADIUS, height) * width + column
         mean += weight * tl.load(at, mask=inside, other=0.0)
         square += weight * tl.load(at + pixels, mask=inside, other=0.0)
-        product += weight * tl.load(at + 2 * pixels, mask=inside, other=0.0)
+        product += weight * tl.load(at + pixels + pixels, mask=inside, other=0.0)
     my = tl.load(mean_y + i, mask=inside, other=0.0)
     b = 2.0 * (product - mean * my) + C2
     d = square - mean * mean + tl.load(variance_y + i, mask=inside, other=0.0) + C2
@@ -114,7 +116,7 @@ def ssim_maps(
     by_square = -e * scaled
     tl.store(maps + i, 2.0 * ((b - a) * inverse * my - (d * scaled + by_square) * mean), mask=inside)
     tl.store(maps + pixels + i, by_square, mask=inside)
-    tl.store(maps + 2 * pixels + i, 2.0 * a * inverse, mask=inside)
+    tl.store(maps + pixels + pixels + i, 2.0 * a * inverse, mask=inside)
     x = tl.load(image + i, mask=inside, other=0.0)
     y = tl.load(target + i, mask=inside, other=0.0)
     tl.store(sums + tl.program_id(0), tl.sum(tl.abs(x - y), 0))
@@ -166,6 +168,6 @@ def gradient_across(
     y = tl.load(target + i, mask=inside, other=0.0)
     total = _folded(down, line, column, 1, width, inside, t0, t1, t2, t3, t4, t5)
     total += 2.0 * x * _folded(down, pixels + line, column, 1, width, inside, t0, t1, t2, t3, t4, t5)
-    total += y * _folded(down, 2 * pixels + line, column, 1, width, inside, t0, t1, t2, t3, t4, t5)
+    total += y * _folded(down, pixels + line + pixels, column, 1, width, inside, t0, t1, t2, t3, t4, t5)
     sign = tl.where(x > y, 1.0, 0.0) - tl.where(x < y, 1.0, 0.0)
     tl.store(grad + i, (by_ssim * total + by_l1 * sign) * tl.load(by_loss), mask=inside)

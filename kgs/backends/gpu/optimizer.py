@@ -15,7 +15,7 @@ _TENSORS = 6  # of a launch of `update_by_adam`
 
 
 class GpuOptimizer(OptimizerStages):
-    """Each stage is one launch."""
+    """Each stage is one launch, of Adam one for six tensors."""
 
     def adam(self, updates: list[AdamUpdate], betas: tuple[float, float], eps: float) -> None:
         """See `OptimizerStages.adam`; six tensors a launch."""

@@ -5,6 +5,7 @@ A failed check is not kept: the next process checks again.
 
 import hashlib
 import json
+import os
 import platform
 from contextlib import suppress
 from pathlib import Path
@@ -18,10 +19,11 @@ from kgs._support.version import __version__
 
 _FILE = "kgs_self_check.json"
 _DRIVERS = ("nvidia", "amdgpu", "xe", "i915")  # modules of Linux
+_SETTINGS = ("TRITON", "PTXAS", "LLVM", "AMDGCN")  # in names of variables
 
 
 def is_kept(device: torch.device) -> bool:
-    """Whether a check has passed with this card, driver, torch, Triton and kernels; False where it cannot be read.
+    """Whether a check has passed with all that `_subject` names; False where it cannot be read.
 
     Args:
         device: a GPU.
@@ -53,9 +55,15 @@ def _subject(device: torch.device) -> dict[str, str]:
         "driver": _driver(card),
         "torch": torch.__version__,
         "triton": triton.__version__,
+        "settings": _settings(),
         "kgs": __version__,
         "source": _source(),
     }
+
+
+def _settings() -> str:
+    """What the environment says to Triton's compiler, as another assembler."""
+    return ", ".join(f"{k}={v}" for k, v in sorted(os.environ.items()) if any(word in k for word in _SETTINGS))
 
 
 def _driver(card: Any) -> str:
