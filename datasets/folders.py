@@ -285,6 +285,8 @@ def _about_file(path: Path) -> str:
     advice = [advice for patterns, advice in _NOT_READ.items() if len(patterns) == 1 and path.match(patterns[0])]
     if path.suffix.lower() == ".zip":
         advice = ["it is an archive: unpack it first"]
+    if path.suffix.lower() in (*IMAGE_SUFFIXES, *HEIC_SUFFIXES):
+        advice = [f"for photos, name their folder: {path.parent}"]
     return ": ".join(["expected a folder, got a file", *advice[:1]])
 
 

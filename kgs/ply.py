@@ -137,6 +137,9 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
                     raise DataError(path, name, "expected this property of a splat, got none")
             columns = _read_columns(path, header, file)
     except OSError as error:
+        if path.is_dir():
+            meant = f": its splat is {path / 'splat.ply'}" if (path / "splat.ply").is_file() else ""
+            raise DataError(path, "", f"expected a PLY file, got a folder{meant}") from error
         raise DataError(path, "", f"cannot be read: {error.strerror or error}") from error
     except MemoryError as error:
         raise DataError(path, "vertex", f"expected as many as fit into memory, got {vertex.count}") from error

@@ -114,6 +114,16 @@ MISTAKES = [  # words, what is said of them, and a package that is not installed
     ("fit photos -o photos", "photos: holds photos or files of a scene", ""),
     ("fit missing -o out", "missing: no such file or folder", ""),
     ("fit empty -o out", "empty: expected photos", ""),
+    (
+        "fit photos/0.png -o out",
+        "photos/0.png: expected a folder, got a file: for photos, name their folder: photos",
+        "",
+    ),
+    (
+        "fit photos/0.png photos/1.png photos/2.png photos/3.png -o out",
+        "expected one path, got 4 (0.png, 1.png, 2.png and 1 more). For photos, name their folder",
+        "",
+    ),
     ("fit two -o out", "two: expected at least 3 photos, found 2", ""),
     ("fit poses -o out", "poses: has camera poses but no photos", ""),
     ("fit heic -o out", "heic: 1 of 4 photos cannot be read", "pi_heif"),

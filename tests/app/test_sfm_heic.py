@@ -122,3 +122,12 @@ def test_of_a_photo_and_its_conversion_the_jpeg_is_taken(folder):
     assert [path.name for path in find_photos(folder)] == ["IMG_1.heic", "IMG_3.jpg", "img_2.jpg"]
     (note,) = notes_on(folder)
     assert "IMG_2.HEIC" in note
+
+
+def test_a_folder_without_photos_names_the_endings_that_are_read(tmp_path, monkeypatch):
+    with pytest.raises(DataError, match=r"\.jpg .*\.heic"):
+        find_photos(tmp_path)
+    monkeypatch.setattr(folders, "has_heic", lambda: False)
+    with pytest.raises(DataError) as error:
+        find_photos(tmp_path)
+    assert ".heic" not in str(error.value)

@@ -40,7 +40,8 @@ def page(
 
     Args:
         ply: a 3DGS PLY file.
-        cameras: the scene (folder of LLFF, COLMAP, Blender or nerfstudio) whose cameras and photos to use.
+        cameras: the scene whose cameras and photos to use: the folder of the results of kgs fit, or one of LLFF,
+            COLMAP, Blender or nerfstudio.
         out: the HTML file to write.
         size: reduce the photos to this many pixels on their longer side. Unless given: to the size of the fit, where
             the splat or the scene is in the folder of one.

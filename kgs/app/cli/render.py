@@ -33,7 +33,8 @@ def render(
 
     Args:
         ply: a 3DGS PLY file.
-        cameras: the scene (folder of LLFF, COLMAP, Blender or nerfstudio) whose cameras to use.
+        cameras: the scene whose cameras to use: the folder of the results of kgs fit, or one of LLFF, COLMAP, Blender
+            or nerfstudio.
         out: folder for the PNGs, which are named like the scene's photos; not the folder of the photos.
         downscale: reduce the pictures by this factor.
         background: the colour behind the splat; transparent: PNGs with an alpha channel.

@@ -16,10 +16,11 @@ import warnings
 from collections.abc import Callable
 from dataclasses import fields
 from functools import partial, wraps
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
-from kgs._support.errors import ArgumentError, DataError, PhotosRefused, TrainingDiverged, printable
+from kgs._support.errors import ArgumentError, DataError, PhotosRefused, TrainingDiverged, listed, printable
 from kgs.app.console import as_line, log_shown, quiet, say
 from kgs.fit.config import FitConfig, Recipe
 
@@ -183,6 +184,16 @@ def _flags_of(command: Callable[..., Any]) -> dict[str, str]:
     return {name: "--" + path.replace("_", "-") for name, path in paths.items()}
 
 
+def _check_one_path(command: Callable[..., Any], words: list[str]) -> None:
+    """Refuse several files where one path is expected: a shell makes them of PHOTOS/*.jpg."""
+    parameters = inspect.signature(command).parameters.values()
+    given = [*takewhile(lambda word: not word.startswith("-"), words)]
+    is_one = sum(parameter.kind is not parameter.KEYWORD_ONLY for parameter in parameters) == 1
+    if is_one and len(given) > 1 and all(Path(word).exists() for word in given):
+        names = listed([Path(word).name for word in given], 3)
+        raise SystemExit(f"expected one path, got {len(given)} ({names}). For photos, name their folder")
+
+
 def _check_out(command: Callable[..., Any], name: str, words: list[str]) -> None:
     """Refuse a command line that lacks nothing but the folder for the results, and suggest one."""
     out = inspect.signature(command).parameters.get("out")
@@ -204,6 +215,7 @@ def _parse(command: Callable[..., Any], name: str, words: list[str]) -> partial[
 
     from .options import EMPTY, PATHS
 
+    _check_one_path(command, words)
     _check_out(command, name, words)
     prog = f"kgs {name}"
     asked = {*options_in(words)}

@@ -59,7 +59,7 @@ def find_photos(folder: Path) -> list[Path]:
         if deeper:
             reason = f"holds no photos itself, but these folders in it do: {listed_files(deeper)}. Name one of them"
         else:
-            reason = f"expected photos ({' '.join(IMAGE_SUFFIXES)}), found none. {ADVICE}"
+            reason = f"expected photos ({' '.join(_readable())}), found none. {ADVICE}"
         raise DataError(folder, "", ". ".join([reason, *folders.unused_files(folder), *_nameless(folder)]))
     if len(paths) < MIN_PHOTOS:
         reason = f"expected at least {MIN_PHOTOS} photos, found {len(paths)} ({listed_files(paths)}). {ADVICE}"
