@@ -106,7 +106,7 @@ def _no_driver(monkeypatch):
 
 
 def test_kernels_are_compiled_at_once_with_what_they_are_launched_with(monkeypatch):
-    monkeypatch.setattr("os.cpu_count", lambda: 4)
+    monkeypatch.setattr(compiling, "cores", lambda: 4)
     together = threading.Barrier(4)
     kernels = [Kernel(lambda: together.wait(timeout=30)) for _ in range(4)]
     compile_together([called(kernel) for kernel in kernels], CPU)
@@ -126,7 +126,7 @@ def test_one_that_cannot_be_compiled_is_left_out():
 
 def test_the_log_says_how_far_it_is(monkeypatch, caplog):
     monkeypatch.setattr(compiling, "_INTERVAL", 0.02)
-    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    monkeypatch.setattr(compiling, "cores", lambda: 2)
     said = threading.Event()
     monkeypatch.setattr(compiling._log, "filters", [lambda _: said.set() or True])
     with caplog.at_level(logging.INFO, "kgs"):

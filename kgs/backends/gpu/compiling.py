@@ -40,8 +40,13 @@ def needed_launches(run: Callable[[], object]) -> list[Launch]:
     return list({launch.key: launch for launch in launches}.values())
 
 
+def cores() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def compile_together(launches: list[Launch], device: torch.device) -> None:
-    """Compile kernels for a device in as many threads as there are cores, and load them there.
+    """Compile kernels for a device in as many threads as there are cores for it, and load them there.
 
     A record of the log says every few seconds how far it is. A kernel that cannot be compiled is left out: an error
     says so when it is launched.
@@ -50,7 +55,7 @@ def compile_together(launches: list[Launch], device: torch.device) -> None:
     for launch in launches:
         launch.kernel.cache_key  # noqa: B018
     longest_first = sorted(launches, key=lambda launch: len(launch.arguments), reverse=True)
-    pool = ThreadPoolExecutor(max(1, min(len(launches), os.cpu_count() or 1)))
+    pool = ThreadPoolExecutor(max(1, min(len(launches), cores())))
     try:
         waiting = {pool.submit(_compile, launch, device) for launch in longest_first}
         while waiting:
