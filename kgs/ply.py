@@ -139,7 +139,7 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
     except OSError as error:
         if path.is_dir():
             meant = f": its splat is {path / 'splat.ply'}" if (path / "splat.ply").is_file() else ""
-            raise DataError(path, "", f"expected a PLY file, got a folder{meant}") from error
+            raise DataError(path, "", f"cannot be read: expected a PLY file, got a folder{meant}") from error
         raise DataError(path, "", f"cannot be read: {error.strerror or error}") from error
     except MemoryError as error:
         raise DataError(path, "vertex", f"expected as many as fit into memory, got {vertex.count}") from error
