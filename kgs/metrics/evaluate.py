@@ -178,7 +178,7 @@ def _measure(image: Tensor, target: Tensor, share: float, lpips: Lpips | None) -
 def as_text(metrics: dict[str, Any]) -> str:
     """The metrics of a fit as lines of text."""
     lines = list[str]()
-    names = {"psnr": "PSNR", "ssim": "SSIM", "ssim_zero_padded": "SSIM (zero padded)", "lpips_vgg": "LPIPS"}
+    names = {"psnr": "PSNR", "ssim": "SSIM", "lpips_vgg": "LPIPS"}
     if held_out := metrics.get("held_out"):
         measured = [f"{title} {held_out[key]:.4g}" for key, title in names.items() if held_out.get(key) is not None]
         names_of = ", ".join(view["name"] for view in held_out["views"])
