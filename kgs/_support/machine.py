@@ -12,7 +12,7 @@ from pathlib import Path
 import kornia
 import torch
 
-from kgs._support.errors import ArgumentError
+from kgs._support.errors import ArgumentError, quantity
 
 from .version import __version__
 
@@ -31,8 +31,7 @@ def check_device(name: str) -> torch.device:
 def device_name(device: torch.device) -> str:
     """What a user knows a device as: "CPU, 2 cores", of which torch uses so many, or the name of a GPU."""
     if device.type == "cpu":
-        cores = torch.get_num_threads()
-        return f"CPU, {cores} core{'s' if cores > 1 else ''}"
+        return f"CPU, {quantity(torch.get_num_threads(), 'core')}"
     return f"{torch.get_device_module(device).get_device_name(device)} ({device})"
 
 

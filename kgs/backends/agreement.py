@@ -56,9 +56,9 @@ def disagreement(backend: Backend, device: torch.device, steps: tuple[Step, ...]
         device: where; torch is on the CPU where it has no float64 there.
         steps: what is done.
     """
-    backend.compile_ahead(lambda of_cpu: _run(backend, of_cpu, steps), device)
+    backend.compile_ahead(lambda of_cpu: run_stages(backend, of_cpu, steps), device)
     reference_device = device if device.type in ("cpu", "cuda") else torch.device("cpu")
-    found = _run(backend, device, steps)
+    found = run_stages(backend, device, steps)
     exact = _pictured(TorchBackend(), reference_device, steps)
     if backend.has_loss:
         exact += _exact_loss()
@@ -67,7 +67,7 @@ def disagreement(backend: Backend, device: torch.device, steps: tuple[Step, ...]
     return max(_relative(value, expected) for value, expected in zip(found, exact, strict=True))
 
 
-def _run(backend: Backend, device: torch.device, steps: tuple[Step, ...]) -> list[Tensor]:
+def run_stages(backend: Backend, device: torch.device, steps: tuple[Step, ...]) -> list[Tensor]:
     """What a backend finds."""
     found = _pictured(backend, device, steps)
     if backend.has_loss:

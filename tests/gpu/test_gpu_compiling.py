@@ -42,7 +42,7 @@ def cases(size, count, absgrad=False, degree=3):
 
 def test_a_training_step_needs_no_kernel_that_the_check_does_not():
     """Whatever the number of Gaussians and the size of the image, divisible by 16 or not."""
-    checked = forms(lambda: agreement._run(GpuBackend(), CPU, agreement.FITS))
+    checked = forms(lambda: agreement.run_stages(GpuBackend(), CPU, agreement.FITS))
     names = {name for name, _ in checked.values()}
     assert len(names) >= 26
     assert len(checked) <= len(names) + 8
@@ -58,17 +58,17 @@ def test_a_training_step_needs_no_kernel_that_the_check_does_not():
 
 
 def test_several_cameras_need_one_form_of_each_kernel_and_its_constants():
-    found = forms(lambda: agreement._run(GpuBackend(), CPU, (agreement.EVERYTHING,)))
+    found = forms(lambda: agreement.run_stages(GpuBackend(), CPU, (agreement.EVERYTHING,)))
     names = [(name, *constants.items()) for name, constants in found.values()]
     assert len(names) == len(set(names))
 
 
 def test_what_is_needed_is_found_without_launching(monkeypatch):
     monkeypatch.setattr("triton.runtime.interpreter.InterpretedFunction.__getitem__", lambda *_: 1 / 0)
-    found = needed_launches(lambda: agreement._run(GpuBackend(), CPU, (agreement.EVERYTHING,)))
+    found = needed_launches(lambda: agreement.run_stages(GpuBackend(), CPU, (agreement.EVERYTHING,)))
     assert "composite_backward" in {launch.kernel.fn.__name__ for launch in found}
     with pytest.raises(ZeroDivisionError):
-        agreement._run(GpuBackend(), CPU, (agreement.EVERYTHING,))
+        agreement.run_stages(GpuBackend(), CPU, (agreement.EVERYTHING,))
 
 
 # -- with kernels that only record --------------------------------------------------------------------------------

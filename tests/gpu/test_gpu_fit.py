@@ -78,7 +78,7 @@ def test_a_fit_by_kernels_is_that_of_torch_and_goes_on_without_them(scene, few, 
         ours, torchs = (fit.train_step() for fit in fits)
         assert ours == pytest.approx(torchs, rel=2e-5)
     ours, torchs = (fit.state_dict() for fit in fits)
-    for name in ("means", "opacity_logits", "sh_dc"):  # that of quats is all rounding: the first points are round
+    for name in ("means", "opacity_logits", "sh_dc"):  # gradients of round Gaussians to quats are rounding
         torch.testing.assert_close(ours["model"][name], torchs["model"][name], rtol=0.0, atol=1e-5)
         assert ours["optimizer"][name]["step"] == torchs["optimizer"][name]["step"] == 3.0
     assert torch.equal(ours["densifier"]["counts"], torchs["densifier"]["counts"])

@@ -27,13 +27,13 @@ def measure(way: str) -> None:
     import triton
     from host_time import Driver
 
-    from kgs.backends.agreement import FITS, _run
+    from kgs.backends.agreement import FITS, run_stages
     from kgs.backends.gpu import GpuBackend, compiling
     from kgs.backends.gpu.compiling import compile_together, needed_launches
 
     cpu = torch.device("cpu")
     triton.runtime.driver.set_active(Driver())
-    launches = needed_launches(lambda: _run(GpuBackend(), cpu, FITS))
+    launches = needed_launches(lambda: run_stages(GpuBackend(), cpu, FITS))
     compiling.cores = lambda: 1 + WAYS.index(way)
     active: dict[int, list[float]] = {}
     compile_one = compiling._compile

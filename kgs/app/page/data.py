@@ -23,7 +23,7 @@ from kornia.geometry.camera import PinholeCamera
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kgs._support.errors import ArgumentError
+from kgs._support.errors import ArgumentError, quantity
 from kgs.geometry import camera_centers
 from kgs.harmonics import SH_C0
 from kgs.projection import finite_gaussians
@@ -108,7 +108,7 @@ def pack(
     near = ~_strays(values["means"], cameras)
     rows = visible[near]
     strays = len(visible) - len(rows)
-    words = [f"all but {strays} stray Gaussian{'s' if strays > 1 else ''}"] if strays else []
+    words = [f"all but {quantity(strays, 'stray Gaussian')}"] if strays else []
     values = {name: value[near] for name, value in values.items()}
     degree = SH_SIZES.index(values["colors"].shape[1])
     packed = Packed({}, b"")

@@ -2,10 +2,10 @@
 
 `activation`, `projection`, `compositing`, `blending`, `loss` and `optimizer` bring the kernels of a stage to torch,
 which stand in the file of kernels beside it; the other files of kernels are parts of these. `launch` calls them,
-`compiling` compiles them ahead, `verdict` keeps that they passed :func:`self_check`, and
-`entry_counts` tells compositing what projection has counted. Torch defines what is right; a kernel gives the same
-within the rounding of float32, and its formulas are explained in the torch code that it follows. `import kgs` does not
-import triton: a stage is imported when it is first used.
+`compiling` compiles them ahead, `verdict` keeps that they passed :func:`self_check`, and `entry_counts` tells
+compositing what projection has counted. Torch defines what is right; a kernel gives the same within the rounding of
+float32, and its formulas are explained in the torch code that it follows. `import kgs` does not import triton: a stage
+is imported when it is first used.
 
 With TRITON_INTERPRET=1 in the environment the kernels run on a CPU, slowly: so they are tested without a GPU.
 

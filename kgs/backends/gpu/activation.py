@@ -44,7 +44,7 @@ class _Activation(torch.autograd.Function):
         if sh_rest is not None:
             outputs.append(inputs[3].new_empty(n, bands, 3))
             ctx.rest_shape = sh_rest.shape
-        nothing = outputs[:1]  # which is neither read nor written in the place of harmonics
+        nothing = outputs[:1]  # in place of tensors of harmonics: the kernel does not touch it
         rest = 0 if sh_rest is None else 3 * sh_rest.shape[1]
         arguments = (*(inputs + 2 * nothing)[:4], n, *(outputs + nothing)[:3])
         launch(activate_all, (blocks(n, _BLOCK),), *arguments, REST=rest, BANDS=bands, BLOCK=_BLOCK)
