@@ -33,6 +33,10 @@ def size(paths: list[Path]) -> tuple[int, int]:
     return sum(text.count("\n") for text in texts), sum(token.type not in _SKIPPED for token in tokens)
 
 
+def nodes(path: Path) -> list[ast.AST]:
+    return [*ast.walk(ast.parse(path.read_text(encoding="utf-8")))]
+
+
 def lines_of_code(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
     """Lines that hold a part of a statement of a function's body, its docstring apart."""
     body = function.body[1:] if ast.get_docstring(function) else function.body
@@ -52,8 +56,8 @@ def long_functions(path: Path) -> list[str]:
 
 def calls(path: Path, names: tuple[str, ...]) -> list[str]:
     """The places in a file that call one of these functions."""
-    nodes = [node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.Call)]
-    return [f"{path.relative_to(ROOT).as_posix()}:{node.lineno}" for node in nodes if ast.unparse(node.func) in names]
+    found = [node for node in nodes(path) if isinstance(node, ast.Call) and ast.unparse(node.func) in names]
+    return [f"{path.relative_to(ROOT).as_posix()}:{node.lineno}" for node in found]
 
 
 def main() -> None:
