@@ -77,7 +77,8 @@ def test_a_folder_too_deep_or_too_high_is_told_where_the_scene_is(tmp_path: Path
     scene = tmp_path / "data" / "my scene"
     write_colmap(scene)
     (tmp_path / "data" / "a folder before it").mkdir()
-    for given in (tmp_path, scene.parent, *(scene / part for part in ("images", "sparse/0", "sparse/0/images.bin"))):
+    (scene / "notes.txt").touch()
+    for given in (tmp_path, scene.parent, *(scene / part for part in ("images", "sparse/0", "notes.txt"))):
         with pytest.raises(DataError, match="my scene is one: give that folder"):
             load_scene(given)
     write_nerfstudio(tmp_path / "other")
