@@ -14,6 +14,8 @@ import PIL.Image
 from numpy.typing import NDArray
 from PIL import ImageCms
 
+from kgs._support.errors import ArgumentError
+
 _SRGB = ImageCms.createProfile("sRGB")
 _SAME = 3  # levels of 255: a profile that changes no colour by more than this is sRGB under another name
 _PROBE = np.stack(np.meshgrid(*[np.linspace(0, 255, 9).round()] * 3, indexing="ij"), axis=-1).astype(np.uint8)
@@ -77,9 +79,9 @@ Profile = bytes | Colors  # the bytes of an ICC profile, empty where nothing is 
 def colors_of(primaries: int, curve: int) -> Colors:
     """The colours that two numbers of H.273 stand for; a ValueError where they cannot be converted to sRGB."""
     if curve in _HDR:
-        raise ValueError(f"expected a photo of standard range, got HDR ({_HDR[curve]}): save it as a JPEG")
+        raise ArgumentError("colours", "those of standard range", f"HDR ({_HDR[curve]})", advice="save it as a JPEG")
     if primaries not in _PRIMARIES or curve not in _GAMMAS:
-        raise ValueError(f"expected known colours, got primaries {primaries} and curve {curve} of H.273")
+        raise ArgumentError("colours", "known ones", f"primaries {primaries} and curve {curve} of H.273")
     return Colors(*_PRIMARIES[primaries], _GAMMAS[curve])
 
 

@@ -11,7 +11,7 @@ from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
-from kgs._support.errors import DataError
+from kgs._support.errors import DataError, quantity
 
 _JPEG = (".jpg", ".jpeg", ".jpe", ".jfif", ".jif", ".pjpeg", ".pjp")
 IMAGE_SUFFIXES = (".png", *_JPEG, ".webp", ".bmp", ".dib", ".tif", ".tiff")
@@ -76,7 +76,6 @@ _SAME = 8  # levels between the channels of a grey picture that was compressed w
 MASKS_ARE_IN = "masks are in masks/ or the folder that --masks names, or beside their photos as IMG_1_mask.png"
 CAMERAS_REPORT = "photos.json"  # beside a scene whose cameras kgs found: how they were found
 _NO_POSES = "kgs fit finds them; or run COLMAP (its model goes to sparse/0), or nerfstudio's ns-process-data"
-_TO_CONVERT = "photos that cannot be read: convert them to JPEG or PNG"
 _NO_PHOTOS = "take photos out (ns-process-data video does that and finds poses)"
 
 
@@ -184,7 +183,7 @@ def image_folder(root: Path, name: str = "") -> Path | None:
     With a name the folder of that name; a DataError where there is none.
     """
     if name and not (root / name).is_dir():
-        raise DataError(root, "", f"expected the photos in {name}/, found no such folder")
+        raise DataError(root, "", f"the photos in {name}/", "no such folder")
     if name or (root / "images").is_dir():
         return root / (name or "images")
     reduced = [p for p in root.glob("images_*") if p.is_dir() and p.name.removeprefix("images_").isdecimal()]
@@ -256,9 +255,13 @@ def scene_nearby(root: Path) -> Path | None:
     return next(filter(layout_of, others), None)
 
 
-def why_no_scene(root: Path) -> str:
-    """Why a file or folder is not a scene: what it is or holds instead, and what to do."""
-    return _about_folder(root) if root.is_dir() else _about_file(root)
+def no_scene(root: Path) -> DataError:
+    """The error about a file or folder that is not a scene: what it is or holds instead, and what to do."""
+    if not root.is_dir():
+        got, advice = _about_file(root)
+        return DataError(root, "", "a folder", got, advice=advice)
+    got, advice = _about_folder(root)
+    return DataError(root, "", "a scene", got, advice=". ".join(filter(None, [advice, *unused_files(root)])))
 
 
 def has_photos(scene: Path) -> bool:
@@ -275,36 +278,36 @@ def has_photos(scene: Path) -> bool:
     return False
 
 
-def _about_file(path: Path) -> str:
+def _about_file(path: Path) -> tuple[str, str]:
     if not path.exists():
-        return "expected a folder, there is none"
+        return "none", ""
     if path.suffix.lower() in VIDEO_SUFFIXES:
-        return f"expected a folder, got a video: {_NO_PHOTOS}"
+        return "a video", _NO_PHOTOS
     if layout_of(path.parent):
-        return f"expected a folder, got a file: the scene is {path.parent}"
+        return "a file", f"the scene is {path.parent}"
     advice = [advice for patterns, advice in _NOT_READ.items() if len(patterns) == 1 and path.match(patterns[0])]
     if path.suffix.lower() == ".zip":
         advice = ["it is an archive: unpack it first"]
     if path.suffix.lower() in (*IMAGE_SUFFIXES, *HEIC_SUFFIXES):
         advice = [f"for photos, name their folder: {path.parent}"]
-    return ": ".join(["expected a folder, got a file", *advice[:1]])
+    return "a file", next(iter(advice), "")
 
 
-def _about_folder(root: Path) -> str:
-    return ". ".join([_what_is_there(root), *unused_files(root)])
-
-
-def _what_is_there(root: Path) -> str:
+def _about_folder(root: Path) -> tuple[str, str]:
     if folder := scene_nearby(root):
-        return f"is not a scene, but {folder} is one: give that folder"
+        return "another folder", f"{folder} is one: give that folder"
     photos = image_folder(root) or root
     if count := len(list_images(photos)):
-        return f"has {count} photos but no camera poses: {_NO_POSES}"
+        return f"{quantity(count, 'photo')} without camera poses", _NO_POSES
     endings = [p.suffix.lower() for folder in {root, photos} for p in folder.iterdir() if not p.name.startswith(".")]
-    for suffixes, advice in ((UNREADABLE_SUFFIXES, _TO_CONVERT), (VIDEO_SUFFIXES, f"videos: {_NO_PHOTOS}")):
+    others = (
+        (UNREADABLE_SUFFIXES, "photos that cannot be read", "convert them to JPEG or PNG"),
+        (VIDEO_SUFFIXES, "videos", _NO_PHOTOS),
+    )
+    for suffixes, what, advice in others:
         if kinds := [ending[1:].upper() for ending in endings if ending in suffixes]:
-            return f"is not a scene: it holds {len(kinds)} {' and '.join(sorted(set(kinds)))} {advice}"
-    return (
-        "is not a scene: looked for poses_bounds.npy (LLFF), sparse/0 (COLMAP), transforms_train.json (Blender) and "
-        "transforms.json (nerfstudio)"
+            return f"{len(kinds)} {' and '.join(sorted(set(kinds)))} {what}", advice
+    return "another folder", (
+        "there is no poses_bounds.npy (LLFF), sparse/0 (COLMAP), transforms_train.json (Blender) or transforms.json "
+        "(nerfstudio)"
     )

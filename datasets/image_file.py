@@ -21,7 +21,7 @@ from PIL.ExifTags import IFD, Base
 from PIL.Image import Exif
 from PIL.ImageFile import ImageFile as Opened
 
-from kgs._support.errors import DataError, listed
+from kgs._support.errors import ArgumentError, DataError, cause_of, listed
 from kgs._support.extras import check_opencv
 
 from . import folders
@@ -98,7 +98,7 @@ class ImageFile:
                 with file:
                     self._metadata = _read_header(self.path, file)
             except OSError as error:
-                raise DataError(self.path, "", f"cannot be read ({error.strerror})") from error
+                raise DataError(self.path, "", "a file that can be read", advice=f"{error.strerror}") from error
         return self._metadata
 
     def read(self) -> Image:
@@ -110,11 +110,11 @@ class ImageFile:
         metadata = self.metadata  # the size is checked before anything is decoded
         try:
             pixels = _decode(_plugin(self.path, data[:_MAX_SIGNATURE]), data)
-        except ValueError as error:
-            raise DataError(self.path, "", str(error)) from error
+        except ArgumentError as error:
+            raise error.about(self.path) from error
         height, width = pixels.shape[:2]
         if metadata.size != (width, height):
-            raise DataError(self.path, "", f"expected {metadata.size} pixels as its header says, got {(width, height)}")
+            raise DataError(self.path, "", f"{metadata.size} pixels as its header says", (width, height))
         self._data = None
         return to_srgb(pixels, metadata.profile)
 
@@ -152,7 +152,7 @@ def read_bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise DataError(path, "", f"cannot be read ({error.strerror})") from error
+        raise DataError(path, "", "a file that can be read", advice=f"{error.strerror}") from error
 
 
 def is_heic(data: bytes) -> bool:
@@ -166,7 +166,7 @@ def _plugin(path: Path, head: bytes) -> type[Opened]:
     `PIL.Image.open` is not used: its bound on pixels does not depend on the number of bytes in the file.
     """
     if not head:
-        raise DataError(path, "", "expected an image, got an empty file")
+        raise DataError(path, "", "an image", "an empty file")
     if is_heic(head) and folders.has_heic():
         import pi_heif
 
@@ -175,7 +175,7 @@ def _plugin(path: Path, head: bytes) -> type[Opened]:
     for signature, plugin in _PLUGINS.items():
         if head.startswith(signature):
             return plugin
-    raise DataError(path, "", "cannot be decoded: expected a PNG, JPEG, WebP, BMP or TIFF image")
+    raise DataError(path, "", "a PNG, JPEG, WebP, BMP or TIFF image", "another file")
 
 
 def _read_header(path: Path, file: IO[bytes]) -> Metadata:
@@ -199,14 +199,14 @@ def _read_header(path: Path, file: IO[bytes]) -> Metadata:
             tiff = image.tag_v2  # type: ignore[attr-defined]  # of TIFF only
             tile = int(tiff.get(Base.TileWidth, 1)), int(tiff.get(Base.TileLength, 1))
     except Exception as error:  # damaged bytes raise whatever Pillow's plugins happen to raise
-        reason = f"cannot be decoded: damaged, cut short, or an unusual {plugin.format} ({error})"
-        raise DataError(path, "", reason) from error
+        got = f"a {plugin.format} that is damaged, cut short or unusual"
+        raise DataError(path, "", "an image that can be decoded", got, advice=cause_of(error)) from error
     check_size(path, *size, length)
     check_size(path, *tile, length)  # tiles are decoded whole
     try:
         profile = _profile(image, file, chunks, tags)
-    except ValueError as error:
-        raise DataError(path, "", str(error)) from error
+    except ArgumentError as error:
+        raise error.about(path) from error
     return Metadata(size, tags, profile)
 
 
@@ -247,7 +247,7 @@ def _profile(image: Opened, file: IO[bytes], chunks: dict[bytes, bytes], tags: d
     if image.format == "PNG" and len(cicp := chunks.get(b"cICP", b"")) == 4:
         primaries, curve, matrix, full = cicp
         if (matrix, full) != (0, 1):
-            raise ValueError(f"expected RGB of the full range, got matrix {matrix} and range {full} in its cICP chunk")
+            raise ArgumentError("cICP", "RGB of the full range", f"matrix {matrix} and range {full}")
         return colors_of(primaries, curve)
     if icc:
         return icc
@@ -299,11 +299,13 @@ def _left_to_turn(image: Opened, file: IO[bytes]) -> int:
 def check_size(path: Path, width: int, height: int, size: int) -> None:
     """Raise DataError about `path` if so many pixels should not be decoded from a file of `size` bytes."""
     if width < 1 or height < 1:
-        raise DataError(path, "header", f"expected an image of at least 1x1 pixels, got {width}x{height}")
+        raise DataError(path, "header", "an image of at least 1x1 pixels", f"{width}x{height}")
     # Photos have fewer than 20 pixels per byte, a PNG of one colour 1032. Any file may have 2^21 pixels (48 MiB while
     # decoded); images of one colour may have 2^24 (384 MiB). More, up to 2^28, need a byte for every 32.
-    if width * height > min(2**28, max(2**21, min(2**24, 2048 * size), 32 * size)):
-        raise DataError(path, "header", f"claims {width}x{height} pixels in {size} bytes: a decompression bomb")
+    most = min(2**28, max(2**21, min(2**24, 2048 * size), 32 * size))
+    if width * height > most:
+        expected = f"at most {most} pixels in {size} bytes"
+        raise DataError(path, "header", expected, f"{width}x{height}", advice="it is a decompression bomb")
 
 
 def _decode(plugin: type[Opened], data: bytes) -> Image:
@@ -319,10 +321,11 @@ def _decode(plugin: type[Opened], data: bytes) -> Image:
             plugin(io.BytesIO(data)).verify()  # the check sums, which decoders pass over
             return _to_float(_decode_png(image, data))
         return _to_float(_decode_with_pillow(image))
-    except (ValueError, MemoryError):
+    except (ArgumentError, MemoryError):
         raise
     except Exception as error:  # neither Pillow, Kornia nor OpenCV has one class of errors for damage
-        raise ValueError("the image is damaged, truncated, or has other colours than grey or RGB") from error
+        got = "ones that are damaged, cut short, or have other colours than grey or RGB"
+        raise ArgumentError("pixels", "those of an image", got, advice=cause_of(error)) from error
 
 
 def _to_float(pixels: NDArray[np.uint8 | np.uint16]) -> Image:
@@ -342,10 +345,13 @@ def _decode_with_opencv(data: bytes) -> NDArray[np.uint8 | np.uint16]:
     """RGB or RGBA, upright if it is a TIFF."""
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None:
-        raise ValueError("OpenCV cannot decode this as an image (truncated, or no image?)")
+        raise ArgumentError(
+            "pixels", "those of an image", "ones that OpenCV cannot decode", advice="are they cut short?"
+        )
     channels = image.shape[2] if image.ndim == 3 else 1
     if image.dtype not in (np.uint8, np.uint16) or channels not in _TO_RGB:
-        raise ValueError(f"expected 8 or 16 bit integers in 1, 3 or 4 channels, got {image.dtype} in {channels}")
+        got = f"{image.dtype} in {channels}"
+        raise ArgumentError("pixels", "8 or 16 bit integers in 1, 3 or 4 channels", got)
     return np.asarray(cv2.cvtColor(image, _TO_RGB[channels]))
 
 
@@ -368,7 +374,7 @@ def _decode_png(image: Opened, data: bytes) -> NDArray[np.uint8 | np.uint16]:
 def _decode_jpeg(image: Opened, data: bytes, end: int) -> NDArray[np.uint8]:
     """RGB of a JPEG, the header of whose first scan has this end. What lies behind the image is ignored."""
     if image.mode == "CMYK":
-        raise ValueError("expected a JPEG of grey or RGB, got CMYK: convert it to RGB")
+        raise ArgumentError("colours", "grey or RGB", "CMYK", advice="convert it to RGB")
     # Only progressive images use its last three bytes. In others some phones leave them 0, and decoders warn of it.
     if "progressive" not in image.info and data[end - 3 : end] == b"\0\0\0":
         data = data[: end - 3] + b"\0\x3f\0" + data[end:]
@@ -379,7 +385,7 @@ def _decode_tiff(image: Opened, data: bytes) -> Image:
     """RGB or RGBA in [0, 1] of a TIFF, as stored, its colours not multiplied by alpha."""
     tags = image.tag_v2  # type: ignore[attr-defined]  # of TIFF only
     if lab := _LAB.get(int(tags.get(Base.PhotometricInterpretation, 2))):
-        raise ValueError(f"expected a TIFF of grey or RGB, got {lab}")
+        raise ArgumentError("colours", "grey or RGB", lab)
     orientation = int(tags.get(Base.Orientation, 1))
     samples = int(tags.get(Base.SamplesPerPixel, 1))
     alpha = tags.get(Base.ExtraSamples, (0,))[0]

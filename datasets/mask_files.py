@@ -57,7 +57,7 @@ def find_mask_files(photos: Sequence[Path], root: Path, folder: Path | None = No
             one fits no photo or several, or two fit one. Of other folders such masks are not used.
     """
     if folder is not None and not folder.is_dir():
-        raise DataError(folder, "", "expected a folder of masks, found no such folder")
+        raise DataError(folder, "", "a folder of masks", "no such folder")
     parents = [parent for parent in sorted({photo.parent for photo in photos}) if parent.is_dir()]
     on_disk = _by_name(photo for parent in parents for photo in list_images(parent))
     outer_folders = _outer_folders(root, parents)
@@ -73,7 +73,7 @@ def find_mask_files(photos: Sequence[Path], root: Path, folder: Path | None = No
     for searched_folder, own in searched.items():
         masks, others = _pictures(searched_folder, own)
         if folder is not None and not masks:
-            raise DataError(folder, "", "expected masks, pictures with the stems of the photos, found none")
+            raise DataError(folder, "", "masks, pictures with the stems of the photos", "none")
         found, rejected = _of_folder(searched_folder, masks, own, on_disk, is_strict)
         is_strict = is_strict and not masks
         unused += [*others, *rejected, *(mask for photo, mask in found.items() if photo in keeping)]
@@ -123,18 +123,18 @@ def _of_folder(
     rejected = list[Path]()
     for mask in masks:
         fitting = _fitting(mask, by_name, folder)
-        reason = ""
+        wrong = None
         if len(fitting) > 1:
-            reason = f"expected a mask of one photo, it fits {fitting[0]} and {fitting[1]}"
+            wrong = ("a mask of one photo", f"one that fits {fitting[0]} and {fitting[1]}")
         elif not fitting and not _fitting(mask, on_disk, folder):
-            reason = "fits no photo: expected the stem of one, as IMG_1.png for IMG_1.jpg"
+            wrong = ("the stem of a photo, as IMG_1.png for IMG_1.jpg", "that of none")
         elif fitting and fitting[0] in found:
-            reason = f"expected one mask of {fitting[0].name}, got {found[fitting[0]].name} too"
+            wrong = (f"one mask of {fitting[0].name}", f"{found[fitting[0]].name} too")
         elif fitting:
             found[fitting[0]] = mask
-        if reason and is_strict:
-            raise DataError(mask, "", reason)
-        if reason:
+        if wrong and is_strict:
+            raise DataError(mask, "", *wrong)
+        if wrong:
             rejected.append(mask)
     return found, rejected
 
@@ -173,7 +173,7 @@ def _beside(photos: Sequence[Path], parents: Sequence[Path]) -> dict[Path, Path]
             if photo not in known or mask in known:
                 continue
             if photo in found:
-                raise DataError(mask, "", f"expected one mask of {photo.name}, got {found[photo].name} too")
+                raise DataError(mask, "", f"one mask of {photo.name}", f"{found[photo].name} too")
             found[photo] = mask
     return found
 

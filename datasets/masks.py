@@ -34,10 +34,10 @@ class Mask(NamedTuple):
         kept = np.asarray(kept > 0.5 if self.keeps_white else kept == 0, np.float32)
         rows, columns = kept.shape
         if not Intrinsics(columns, rows, 1, 1, 0, 0).same_aspect(width, height):
-            reason = f"expected the shape of {photo.name}, {width}x{height}, got {columns}x{rows}"
-            raise DataError(self.file.path, "", reason)
+            expected = f"the shape of {photo.name}, {width}x{height}"
+            raise DataError(self.file.path, "", expected, f"{columns}x{rows}")
         if not kept.any():
-            raise DataError(self.file.path, "", f"expected pixels of {photo.name} that are kept, got none")
+            raise DataError(self.file.path, "", f"pixels of {photo.name} that are kept", "none")
         if (columns, rows) == (width, height):
             return kept
         return np.asarray(cv2.resize(kept, (width, height), interpolation=cv2.INTER_AREA), np.float32)

@@ -167,8 +167,7 @@ def _check_size(scene: Scene, config: FitConfig, lpips: Lpips | None) -> None:
     for views in (scene.train, scene.test):
         height, width = views.images.shape[-2:]
         if min(height, width) < smallest:
-            reason = f"expected at least {smallest}x{smallest} pixels, got {width}x{height}"
-            raise DataError(scene.root, "images", reason)
+            raise DataError(scene.root, "images", f"at least {smallest}x{smallest} pixels", f"{width}x{height}")
 
 
 def _check_out(out: Path, scene: Scene) -> None:
@@ -176,7 +175,7 @@ def _check_out(out: Path, scene: Scene) -> None:
     try:
         check_folder(out, scene.root)
     except OSError as error:
-        raise DataError(out, "", f"expected a folder that results can be written to ({error.strerror})") from error
+        raise DataError(out, "", "a folder that results can be written to", advice=f"{error.strerror}") from error
 
 
 def _trainer(

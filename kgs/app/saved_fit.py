@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kgs._support.errors import DataError
+from kgs._support.errors import ArgumentError, DataError, quoted
 from kgs._support.json_files import read_json
 from kgs.app.files.publishing import complete
 from kgs.app.files.results_folder import CHECKPOINT
@@ -31,12 +31,12 @@ def read_settings(path: Path) -> tuple[SceneRequest, FitConfig]:
     settings = read_json(path)
     for name in ("request", "fit"):
         if not isinstance(settings.get(name), dict):
-            raise DataError(path, name, f"expected an object, got {str(settings.get(name, 'none'))[:60]!r}")
+            raise DataError(path, name, "an object", quoted(settings.get(name)))
     request = SceneRequest.from_dict(settings["request"], path)
     try:
         return request, FitConfig.from_dict(settings["fit"])
-    except ValueError as error:
-        raise DataError(path, "fit", str(error)) from error
+    except ArgumentError as error:
+        raise error.about(path, f"fit.{error.name}") from error
 
 
 def load_fit(
@@ -67,8 +67,8 @@ def load_fit(
         backend = former_or_auto(values["backend"], model.means.device)
     if values["step"] != metrics.get("steps"):
         whose = "that of the previous checkpoint, " if damage else ""
-        reason = f"expected that of metrics.json, {metrics.get('steps')}, got {whose}{values['step']}: resume the fit"
-        raise DataError(path, "step", reason)
+        expected = f"that of metrics.json, {metrics.get('steps')}"
+        raise DataError(path, "step", expected, f"{whose}{values['step']}", advice="resume the fit")
     if damage and say is not None:
         say(f"{damage}; the previous checkpoint is used")
     scene = _posed(_exposed(request.load(out, say), path, values), path, values)
@@ -81,16 +81,15 @@ def _read_model(path: Path, values: dict[str, Any]) -> GaussianModel:
     try:
         check_plain(values, "backend", "near_plane", "step")
     except KeyError as error:
-        raise DataError(path, str(error.args[0]), "expected this entry in a checkpoint, got none") from error
-    except ValueError as error:
-        field, _, reason = str(error).partition(": ")
-        raise DataError(path, field, reason) from error
+        raise DataError(path, str(error.args[0]), "this entry in a checkpoint", "none") from error
+    except ArgumentError as error:
+        raise error.about(path) from error
     try:
         model = GaussianModel(**values["model"])
         part = values.get("shown")
         return model.select(**part) if part else model
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise DataError(path, "model", f"expected the Gaussians of a fit, got {error}") from error
+        raise DataError(path, "model", "the Gaussians of a fit", str(error)) from error
 
 
 def _exposed(scene: Scene, path: Path, values: dict[str, Any]) -> Scene:
@@ -98,7 +97,7 @@ def _exposed(scene: Scene, path: Path, values: dict[str, Any]) -> Scene:
     try:
         return with_exposure(scene, Decisions.from_dict(values.get("decisions", {})))
     except (KeyError, TypeError, ValueError) as error:
-        raise DataError(path, "decisions", f"expected the gains of {len(scene.train)} photos: {error}") from error
+        raise DataError(path, "decisions", f"the gains of {len(scene.train)} photos", str(error)) from error
 
 
 def _posed(scene: Scene, path: Path, values: dict[str, Any]) -> Scene:
@@ -109,8 +108,8 @@ def _posed(scene: Scene, path: Path, values: dict[str, Any]) -> Scene:
     extrinsics = poses.get("extrinsics") if isinstance(poses, dict) else None
     if not (isinstance(extrinsics, Tensor) and extrinsics.shape[1:] == (4, 4)):
         given = tuple(extrinsics.shape) if isinstance(extrinsics, Tensor) else type(poses).__name__
-        raise DataError(path, "poses", f"expected extrinsics (V, 4, 4), got {given}")
+        raise DataError(path, "poses", "extrinsics (V, 4, 4)", given)
     if len(extrinsics) != len(scene.train):
-        reason = f"has {len(scene.train)} training views, but the fit has poses of {len(extrinsics)}: fit again"
-        raise DataError(scene.root, "train", reason)
+        expected = f"the {len(extrinsics)} training views of the fit"
+        raise DataError(scene.root, "train", expected, len(scene.train), advice="fit again")
     return with_extrinsics(scene, extrinsics)

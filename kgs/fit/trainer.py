@@ -46,12 +46,11 @@ _LOOK = 20  # steps between limits of the scales, and on a GPU between looks for
 
 @contextmanager
 def _errors_of(path: str | PathLike[str]) -> Iterator[None]:
-    """Turn a ValueError, which begins with the name of an entry, into an error about this checkpoint."""
+    """Turn an ArgumentError, which names an entry, into an error about this checkpoint."""
     try:
         yield
-    except ValueError as error:
-        field, _, reason = str(error).partition(": ")
-        raise DataError(path, field, reason) from error
+    except ArgumentError as error:
+        raise error.about(path) from error
 
 
 class Trainer:
@@ -174,7 +173,7 @@ class Trainer:
         state = self.state
         schedule = self.plan.schedule
         if state.step >= schedule.steps:
-            raise ArgumentError(f"steps: expected a step of {schedule.steps} to be left, got none")
+            raise ArgumentError("steps", f"a step of {schedule.steps} to be left", "none")
         start = time.perf_counter()
         with threads_beside(self.plan.backend), torch.enable_grad():
             loss = self._optimize()
@@ -289,7 +288,7 @@ class Trainer:
             if decay is None:  # more steps may have another
                 decay = saved["recipe"]["opacity_decay"]
         except (KeyError, TypeError) as error:
-            raise DataError(path, "config", f"expected the configuration of a fit, got one without {error}") from error
+            raise DataError(path, "config", "the configuration of a fit", f"one without {error}") from error
         with _errors_of(path):
             config = replace(config, **decided, recipe=replace(config.recipe, opacity_decay=decay))
         plan = make_plan(scene, config)

@@ -81,7 +81,7 @@ def agreed_cameras(
         kept = {image: name for image, name in names.items() if name not in left_out}
         geometries = {pair: geometry for pair, geometry in geometries.items() if left_out.keys().isdisjoint(pair)}
         if reason := why_no_cameras(list(kept.values()), pairs, geometries):
-            raise PhotosRefused(folder, "", reason)
+            raise PhotosRefused(folder, "", "photos whose cameras can be found", advice=reason)
         solvers = _Solvers((first, second), second_matches, images, work, seed, exif_focals(photos), executor, pairs)
         solutions, held = solvers.solve(kept)
         while untrusted := without_cameras(solutions, list(kept.values()), pairs):

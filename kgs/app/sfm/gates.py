@@ -21,6 +21,7 @@ MIN_POINTS = 50  # that each photo sees
 MAX_DEGREES = 2.0  # between the two solvers' rotations of a pair
 MAX_RATIO = 1.15  # of their focal lengths
 MIN_RISE = 0.03  # relative growth of the squared errors if the focal length is a quarter off
+_TRUSTED = "photos whose cameras can be trusted"
 MIN_SHIFT = 1.0  # pixels; photos whose matches move less in the median were taken from one place
 _PLANAR = 0.97  # share of matches that one homography explains; a scene with depth has a pair with a lower one
 _WITHOUT = "To fit only some of the photos, take the others out of the folder"
@@ -118,24 +119,26 @@ def judge(
     reasons = [objections(cameras, names, longest) for cameras in solutions]
     good = {i: cameras for i, cameras in enumerate(solutions) if cameras and not reasons[i]}
     if not good:
-        raise PhotosRefused(folder, "", refusal(reasons[0], names, pairs, forward, _missing(solutions[0], names)))
+        raise PhotosRefused(
+            folder, "", _TRUSTED, advice=refusal(reasons[0], names, pairs, forward, _missing(solutions[0], names))
+        )
     for cameras in solutions:  # nothing confirms a photo that only one solver registered
         if missing := _missing(cameras, names):
             who = ", ".join(missing)
             reason = f"kgs finds the cameras in two ways, and only one could place {who}, so that nothing confirms it"
-            raise PhotosRefused(folder, "", refusal([reason], names, pairs, forward, missing))
+            raise PhotosRefused(folder, "", _TRUSTED, advice=refusal([reason], names, pairs, forward, missing))
     both = [cameras for cameras in solutions if cameras]
     if doubt := focal_doubt(both):
-        raise PhotosRefused(folder, "", focal_refusal(doubt, names, pairs, forward))
+        raise PhotosRefused(folder, "", _TRUSTED, advice=focal_refusal(doubt, names, pairs, forward))
     degrees, pair = disagreement(*both)
     if degrees > MAX_DEGREES:
         reason = (
             f"kgs finds the cameras in two ways, and they disagree about {' and '.join(pair)} (by "
             f"{degrees:.3g} degrees; expected at most {MAX_DEGREES:g})"
         )
-        raise PhotosRefused(folder, "", refusal([reason], names, pairs, forward))
+        raise PhotosRefused(folder, "", _TRUSTED, advice=refusal([reason], names, pairs, forward))
     if doubt := focal_difference(both):
-        raise PhotosRefused(folder, "", focal_refusal(doubt, names, pairs, forward))
+        raise PhotosRefused(folder, "", _TRUSTED, advice=focal_refusal(doubt, names, pairs, forward))
     sure = {i: cameras for i, cameras in good.items() if cameras.focal_rise >= MIN_RISE} or good
     return max(sure, key=lambda i: min(sure[i].points.values())), degrees
 
@@ -197,7 +200,7 @@ def table(names: Sequence[str], pairs: Pairs) -> str:
 
 
 def why_no_cameras(names: Sequence[str], pairs: Pairs, geometries: Mapping[tuple[str, str], PairGeometry]) -> str:
-    """Why matches cannot give cameras, and what to photograph next, as an error message; "" if they can.
+    """Why matches cannot give cameras, and what to photograph next, as the advice of an error; "" if they can.
 
     Args:
         names: the names of all photos.
@@ -224,7 +227,7 @@ def why_no_cameras(names: Sequence[str], pairs: Pairs, geometries: Mapping[tuple
         reason = f"the photos fall into {len(groups)} groups that do not overlap ({listed})"
         between = f"take photos from places between {' and '.join(weakest_link(names, pairs))}"
         advice = f"If they show two scenes, keep one group in the folder; if they show one, {between}"
-    return f"no cameras: {reason}. {advice}. {_WITHOUT}.\n{table(names, pairs)}"
+    return f"{reason}. {advice}. {_WITHOUT}.\n{table(names, pairs)}"
 
 
 def is_forward(geometries: Mapping[tuple[str, str], PairGeometry]) -> bool:
@@ -234,12 +237,12 @@ def is_forward(geometries: Mapping[tuple[str, str], PairGeometry]) -> bool:
 
 
 def focal_refusal(doubt: str, names: Sequence[str], pairs: Pairs, forward: bool = False) -> str:
-    """The error message if neither the photos nor their Exif determine the focal length; `doubt` says why."""
+    """The advice if neither the photos nor their Exif determine the focal length; `doubt` says why."""
     if forward:
         reason = f"the photos do not tell the focal length, and their Exif does not say it: {doubt}"
-        return f"no cameras that can be trusted: {reason}. {_FORWARD}.\n{table(names, pairs)}"
+        return f"{reason}. {_FORWARD}.\n{table(names, pairs)}"
     return (
-        "no cameras that can be trusted: the photos do not tell the focal length, as a rule because they are close "
+        "the photos do not tell the focal length, as a rule because they are close "
         f"together, and their Exif does not say it: {doubt}, and the depth of the scene is as unsure. What helps: "
         "larger steps to the side or up, so that neighbours are 3 to 20 degrees apart; or the photos as the camera "
         f"wrote them, since messengers and many editors drop Exif.\n{table(names, pairs)}"
@@ -249,16 +252,16 @@ def focal_refusal(doubt: str, names: Sequence[str], pairs: Pairs, forward: bool 
 def refusal(
     reasons: Iterable[str], names: Sequence[str], pairs: Pairs, forward: bool = False, missing: Sequence[str] = ()
 ) -> str:
-    """The error message for cameras that cannot be trusted: the reasons, and what to photograph next.
+    """The advice for cameras that cannot be trusted: the reasons, and what to photograph next.
 
     Photos are advised from beside the first of those that are `missing`, else where fewest matches hold them together.
     """
     if forward:
-        return f"no cameras that can be trusted: {'; '.join(reasons)}. {_FORWARD}. {_WITHOUT}.\n{table(names, pairs)}"
+        return f"{'; '.join(reasons)}. {_FORWARD}. {_WITHOUT}.\n{table(names, pairs)}"
     registered = [name for name in names if name not in missing]
     between = " and ".join(gap(missing[0], registered, pairs) if missing and registered else weakest_link(names, pairs))
     return (
-        f"no cameras that can be trusted: {'; '.join(reasons)}. What helps most: photos from places between {between}, "
+        f"{'; '.join(reasons)}. What helps most: photos from places between {between}, "
         "with steps to the side or up (turning on the spot shows no depth), so that neighbours share two thirds of the "
         f"scene; a scene with texture; all with one lens, without zoom. {_WITHOUT}. With cameras of your own: a folder "
         f"with images/ and sparse/0 from COLMAP.\n{table(names, pairs)}"

@@ -28,22 +28,21 @@ def unlike_others(photos: list[OpenPhoto]) -> dict[str, str]:
     panoramas = [photo.path for photo in photos if photo.is_panorama]
     if 2 * len(panoramas) > len(photos):
         line = f'ffmpeg -i "{panoramas[0].name}" -vf v360=e:rectilinear:h_fov=90:v_fov=67:yaw=0 yaw_0.jpg'
-        reason = f"is a panorama, not a picture of a lens. Cut some from it: `{line}`, the same for other angles"
-        raise PhotosRefused(panoramas[0], "", reason)
+        advice = f"cut some from it: `{line}`, the same for other angles"
+        raise PhotosRefused(panoramas[0], "", "a picture of a lens", "a panorama", advice=advice)
     first = {photo.sha256: photo.name for photo in reversed(photos)}
     copied = {photo.name: first[photo.sha256] for photo in photos if first[photo.sha256] != photo.name}
     left = {name: f"it is the same photo as {other}" for name, other in copied.items()}
     if copied and len(photos) - len(left) < MIN_PHOTOS:
         name, other = next(iter(copied.items()))
         advice = "two copies show no depth. Remove one, and take another photo from a step to the side"
-        reason = f"is the same photo as {other}: {advice}"
-        raise PhotosRefused(photos[0].path.with_name(name), "", reason)
+        path = photos[0].path.with_name(name)
+        raise PhotosRefused(path, "", f"another photo than {other}", "the same", advice=advice)
     photos = [photo for photo in photos if photo.name not in left]
     shapes = by_shape(photos)
     if (usual := _usual(shapes)) is None:
-        groups = _listed(shapes)
-        reason = f"expected photos of one shape, got {len(shapes)} ({groups}). Keep one group in the folder"
-        raise PhotosRefused(folder, "", f"{reason}. Cropped photos do not fit those that are whole")
+        advice = "keep one group in the folder. Cropped photos do not fit those that are whole"
+        raise PhotosRefused(folder, "", "photos of one shape", f"{len(shapes)} ({_listed(shapes)})", advice=advice)
     return left | {
         photo.name: f"its shape is {name}, not {usual}, and no Exif says its focal length: is it cropped?"
         for photo, name in _of_unknown_lens(shapes, usual)

@@ -191,7 +191,7 @@ def _open(path: Path, mask: Mask | None) -> OpenPhoto:
     image = ImageFile(path)
     data = image.load()
     if data[4:8] == b"ftyp" and not (image_file.is_heic(data) and folders.has_heic()):
-        raise DataError(path, "", f"is a HEIC photo or a video under another name. {CONVERT}")
+        raise DataError(path, "", "a photo", "a HEIC photo or a video under another name", advice=CONVERT)
     exif = Exif.of(image.metadata.tags)
     width, height = image.size
     size = (height, width) if exif.is_sideways else (width, height)
