@@ -15,6 +15,7 @@ from unittest.mock import Mock
 import cv2
 import numpy as np
 import pytest
+import torch
 import tyro
 from command import one_line, run
 
@@ -153,7 +154,7 @@ def test_presets_and_details_are_starts_that_options_change(folder, tmp_path, mo
 
     def fit_folder(scene, config, *args, **kwargs):
         seen.append((config, max(scene.train.images.shape[-2:])))
-        raise kgs.DataError(folder, "", "enough")
+        raise kgs.DataError(folder, "", "no more")
 
     monkeypatch.setattr("kgs.app.fit_folder.fit_folder", fit_folder)
     low, high = (DETAILS[name].entries for name in ("low", "high"))
@@ -270,12 +271,15 @@ def test_help_without_a_command(words, capsys):
     [
         (TrainingDiverged("step 1"), 1, "training diverged: step 1"),
         (MemoryError("allocate"), 1, "not enough memory"),
-        (RuntimeError("CUDA out of memory"), 1, "not enough memory"),
+        (torch.OutOfMemoryError("CUDA out of memory"), 1, "not enough memory"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried"), 1, "not enough memory"),
+        (RuntimeError("DefaultCPUAllocator: not enough memory: you tried"), 1, "not enough memory"),
         (OSError(errno.ENOSPC, "No space left on device", "/x"), 1, "/x: No space left on device"),
-        (ArgumentError("device: expected another one"), 2, "--device: expected another one"),
-        (DataError("/x", "", "is damaged"), 3, "/x: is damaged"),
+        (ArgumentError("device", "another one", "cpu"), 2, "--device: expected another one, got cpu"),
+        (DataError("/x", "", "a file"), 3, "/x: expected a file"),
+        (DataError("/x.json", "device", "a list"), 3, "/x.json: device: expected a list"),  # is no option
         (OSError(errno.EACCES, "Permission denied", "/x"), 3, "/x: Permission denied"),
-        (PhotosRefused("/x", "", "take more photos"), 4, "/x: take more photos"),
+        (PhotosRefused("/x", "", "photos", advice="take more"), 4, "/x: expected photos: take more"),
         (KeyboardInterrupt(), 130, "stopped"),
     ],
 )
@@ -293,6 +297,7 @@ def test_an_error_is_one_line_and_an_exit_code_by_its_class(error, code, said, m
         ValueError("dim: expected 2, got 3"),  # whatever torch and NumPy say
         TypeError("unexpected keyword"),
         RuntimeError("no kernel image"),
+        RuntimeError("failed to allocate a register: out of memory operands"),  # says nothing of this machine's memory
         ImportError("cannot import name", name="kgs.ply"),
     ],
 )

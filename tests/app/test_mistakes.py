@@ -59,6 +59,8 @@ def splats(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         ("fit {scene} -o {out} --views 99", "--views: expected"),
         ("fit {scene} -o {out} --init file --init-file {missing}", "missing"),
         ("fit {scene} -o {out} --max-gaussians 0", "--max-gaussians: expected"),
+        ("fit {scene} -o {out} --drop 1", ", got 1.0"),  # a number, not a text
+        ("fit {scene} -o {out} --steps 0", ", got 0"),
         ("fit {scene} -o {out} --device cuda:99", "--device: expected"),
         ("fit {scene} -o {scene}", "files of a scene"),
         ("fit {scene} -o {scene}/transforms_train.json", "expected a folder for results"),
@@ -119,7 +121,7 @@ def splats(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         ("export {empty} -o {here}/a.ply", "empty.ply: vertex: "),
         ("export {fit} -o {here}/a.ply", "expected a PLY file, got a folder: its splat is {fit}/splat.ply"),
         ("render {fit} --cameras {scene} -o {out}", "expected a PLY file, got a folder: its splat is {fit}/splat.ply"),
-        ("export {folder} -o {here}/a.ply", "folder.ply: cannot be read: expected a PLY file, got a folder"),
+        ("export {folder} -o {here}/a.ply", "folder.ply: expected a PLY file, got a folder"),
         ("export {splat} -o {splat}", "--out: "),  # the rounded file would take the place of the plain one
         ("scale {fit} --by 1,2,3 4,5,6 2 -o {fit}", "{fit}"),  # which has the fit that goes on from its checkpoint
         ("scale {here} --by 1,2,3 4,5,6 2 -o {out}", "config.json"),

@@ -128,7 +128,7 @@ def test_half_of_the_steps_are_coarse_at_the_size_that_the_command_chooses(folde
 
     def fit_folder(scene, config, *args, **kwargs):
         seen.append(config.coarse)
-        raise DataError(tmp_path, "", "enough")
+        raise DataError(tmp_path, "", "no more")
 
     monkeypatch.setattr("kgs.app.fit_folder.fit_folder", fit_folder)
     photos = folder(4)

@@ -183,8 +183,8 @@ def test_bad_files_are_described(tmp_path, data, field, reason):
     path.write_bytes(data)
     with pytest.raises(DataError) as caught:
         load_ply(path)
-    assert (caught.value.path, caught.value.field) == (path, field)
-    assert reason in caught.value.reason
+    assert (caught.value.path, caught.value.key) == (path, field)
+    assert reason in str(caught.value)
 
 
 def changed(**values):

@@ -296,7 +296,7 @@ def test_a_profile_of_cmyk(tmp_path: Path) -> None:
     expected = np.where(np.arange(16)[:, None, None] < 8, 1.0, 0.0) * np.ones((16, 16, 3))
     np.testing.assert_allclose(read_image(tmp_path / "a.tif"), expected, atol=2 / 255)
     image.save(tmp_path / "a.jpg", icc_profile=cmyk_profile())
-    with pytest.raises(DataError, match=r"a\.jpg: expected a JPEG of grey or RGB, got CMYK"):
+    with pytest.raises(DataError, match=r"a\.jpg: colours: expected grey or RGB, got CMYK"):
         read_image(tmp_path / "a.jpg")
 
 

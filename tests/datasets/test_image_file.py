@@ -63,7 +63,7 @@ def test_jpegs_cut_short_are_refused_whatever_comes_behind(
     tmp_path: Path, options: tuple[int, ...], kept: float
 ) -> None:
     data = jpeg(*options)
-    with pytest.raises(DataError, match=r"a\.jpg.*(truncated|damaged)"):
+    with pytest.raises(DataError, match=r"a\.jpg.*damaged"):
         read_image(stored(tmp_path / "a.jpg", data[: int(kept * len(data))]))
 
 
@@ -161,7 +161,7 @@ def test_colours_that_a_tiff_multiplies_by_alpha_are_divided_by_it(tmp_path: Pat
 def test_tiffs_of_lab_are_refused_and_those_of_cmyk_read(tmp_path: Path) -> None:
     pillow, path = pytest.importorskip("PIL.Image"), tmp_path / "a.tif"
     pillow.new("LAB", (7, 5)).save(path)
-    with pytest.raises(DataError, match="expected a TIFF of grey or RGB, got CIELab"):
+    with pytest.raises(DataError, match="colours: expected grey or RGB, got CIELab"):
         read_image(path)
     pillow.new("RGB", (7, 5), (200, 60, 30)).convert("CMYK").save(path)
     np.testing.assert_array_equal(read_image(path)[..., :3] * 255, np.broadcast_to([200, 60, 30], (5, 7, 3)))
@@ -192,7 +192,7 @@ def test_the_grey_that_a_png_makes_transparent(tmp_path: Path, bits: int) -> Non
 
 
 def test_alpha_of_grey_images_is_used_or_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="unusual TIFF"):
+    with pytest.raises(DataError, match="TIFF that is damaged, cut short or unusual"):
         read_image(stored(tmp_path / "a.tif", tiff(pixels(np.uint16, 2))))
     multiplied = np.broadcast_to(np.array([40, 51], np.uint8), (5, 7, 2))
     image = read_image(stored(tmp_path / "a.tif", tiff(multiplied, alpha=1)))
@@ -233,7 +233,7 @@ def test_the_plainest_real_image_is_read(tmp_path: Path) -> None:
 def test_bombs_are_refused_before_they_are_decoded(tmp_path: Path, width: int, height: int) -> None:
     path = tmp_path / "bomb.png"
     path.write_bytes(png_of(zlib.compress(bytes(72)), width, height))
-    with pytest.raises(DataError, match=rf"bomb\.png.*claims {width}x{height} pixels"):
+    with pytest.raises(DataError, match=rf"bomb\.png: header: .*, got {width}x{height}"):
         read_image(path)
 
 

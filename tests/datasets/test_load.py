@@ -22,7 +22,7 @@ WITHOUT_POSES = [
     (["IMG_1.HEIC", "IMG_2.HEIC"], "2 HEIC photos that cannot be read: convert them"),
     (["a.dng", "b.avif", "c.AVIF"], "3 AVIF and DNG photos"),
     (["walk.MP4"], "1 MP4 videos: take photos out"),
-    (PHOTOS, "3 photos but no camera poses.*COLMAP.*ns-process-data"),
+    (PHOTOS, "3 photos? without camera poses.*COLMAP.*ns-process-data"),
 ]
 # the first of these that is there is read, and these are empty files
 IN_ORDER = [
@@ -43,7 +43,7 @@ OTHER_PROGRAMS = [
         "Polycam.*ns-process-data polycam.*keyframes/images alone",
     ),
     (["keyframes/corrected_cameras/1.json", "keyframes/cameras/1.json"], "Polycam"),
-    (["cameras/12.json", "images/12.jpg"], "1 photos but no camera poses.*Polycam.*kgs fit takes images alone"),
+    (["cameras/12.json", "images/12.jpg"], "1 photos? without camera poses.*Polycam.*kgs fit takes images alone"),
     (["corrected_cameras/12.json", "corrected_images/12.jpg", "cameras/12.json", "images/12.jpg"], "Polycam"),
     (
         ["metadata.json", "rgb/0.jpg", "rgb/1.jpg", "depth/0.exr"],
@@ -53,14 +53,14 @@ OTHER_PROGRAMS = [
     (["metadata.json", "0.exr"], "Record3D"),
     (
         ["opensfm/reconstruction.json", "images/a.jpg"],
-        "1 photos but no camera poses.*OpenDroneMap.*ns-process-data odm",
+        "1 photos? without camera poses.*OpenDroneMap.*ns-process-data odm",
     ),
     (["scan.r3d"], "Record3D: export it as EXR and JPG"),
     *[([name, "rgbd/0.jpg", "rgbd/0.depth"], "Record3D: export it as EXR") for name in ("metadata", "metadata.json")],
     (["odometry.csv", "camera_matrix.csv", "rgb.mp4"], "Stray Scanner.*kgs fit takes rgb.mp4 alone"),
     (
         ["info.json", "frame_00000.json", "frame_00000.jpg"],
-        "1 photos but no camera poses.*3D Scanner App.*kgs fit takes its photos alone",
+        "1 photos? without camera poses.*3D Scanner App.*kgs fit takes its photos alone",
     ),
     (["lowres_wide.traj", "lowres_wide/1.png"], "ARKitScenes"),
     (["pose/0.txt", "intrinsic/intrinsic_color.txt", "color/0.jpg"], "ScanNet"),
@@ -97,7 +97,7 @@ def test_what_is_no_scene_is_named(tmp_path: Path, names: list[str], message: st
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("nowhere", "there is none"),
+        ("nowhere", "expected a folder, got none"),
         ("transforms.json", "got a file"),
         ("walk.mov", "got a video"),
         ("scan.r3d", "got a file: it is a recording of Record3D: export it as EXR and JPG"),

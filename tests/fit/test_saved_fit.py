@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+from refusals import refused
 
 from kgs._support.errors import DataError
 from kgs.app.saved_fit import read_settings
@@ -44,14 +45,16 @@ WRONG |= {"background": ("red",), "points": (["none"],), "photos": (1,), "roll":
 )
 def test_wrong_requests_are_named(tmp_path, request_, field):
     path = written(tmp_path / "config.json", request_)
-    with pytest.raises(DataError, match="expected") as error:
+    with refused(DataError, path=path, key=field):
         read_settings(path)
-    assert (error.value.path, error.value.field) == (path, field)
 
 
 @pytest.mark.parametrize(
-    "fit", [{"steps": "2000"}, {"init_file": 3}, {"recipe": []}, {"recipe": {"speed": 1.0}}, {"stepz": 1}]
+    ("fit", "key"),
+    [({"steps": "2000"}, "steps"), ({"init_file": 3}, "init_file")]
+    + [({name: value}, "values") for name, value in (("recipe", []), ("recipe", {"speed": 1.0}), ("stepz", 1))],
 )
-def test_wrong_numbers_of_the_fit_are_named(tmp_path, fit):
-    with pytest.raises(DataError, match=r"config\.json.*fit"):
-        read_settings(written(tmp_path / "config.json", **fit))
+def test_wrong_numbers_of_the_fit_are_named(tmp_path, fit, key):
+    path = written(tmp_path / "config.json", **fit)
+    with refused(DataError, path=path, key=f"fit.{key}"):
+        read_settings(path)
