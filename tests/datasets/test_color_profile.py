@@ -269,13 +269,13 @@ def test_what_a_png_says_of_colours(tmp_path: Path, kind: str) -> None:
     [
         ((9, 16, 0, 1), "HDR .PQ."),
         ((9, 18, 0, 1), "HDR .HLG."),
-        ((99, 13, 0, 1), "known colours"),
+        ((99, 13, 0, 1), "known ones"),
         ((1, 13, 0, 0), "full"),
     ],
 )
 def test_colours_that_cannot_be_converted_are_refused(tmp_path: Path, cicp: tuple[int, ...], said: str) -> None:
     (tmp_path / "a.png").write_bytes(with_chunks(patches(), (b"cICP", bytes(cicp))))
-    with pytest.raises(DataError, match=rf"a\.png: expected .*{said}"):
+    with pytest.raises(DataError, match=rf"a\.png: (colours|cICP): expected .*{said}"):
         read_image(tmp_path / "a.png")
 
 

@@ -80,7 +80,7 @@ def test_jpegs_that_libjpeg_warns_of_are_refused(
         cv2.imdecode(np.frombuffer(damaged, np.uint8), cv2.IMREAD_UNCHANGED)
         if capfd.readouterr().err:
             warned += 1
-            with pytest.raises(DataError, match=r"a\.jpg: the (image is damaged|JPEG ends)"):
+            with pytest.raises(DataError, match=r"a\.jpg: pixels: .* damaged, cut short"):
                 read_image(stored(tmp_path / "a.jpg", damaged))
     assert warned >= 8
 
@@ -247,7 +247,7 @@ def test_cut_headers_are_data_errors(tmp_path: Path, suffix: str) -> None:
         with contextlib.suppress(DataError):
             assert read_size(path) == (5, 4)
     path.write_bytes(data[:3])
-    with pytest.raises(DataError, match="decoded"):
+    with pytest.raises(DataError, match="decoded|expected a PNG"):
         read_size(path)
 
 

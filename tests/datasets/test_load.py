@@ -18,7 +18,7 @@ from kgs.datasets import load_scene
 PHOTOS = ["0.jpg", "1.jpg", "2.jpg"]
 WITHOUT_POSES = [
     ([], r"poses_bounds\.npy.*sparse/0.*transforms_train\.json.*transforms\.json"),
-    (["notes.txt", "._IMG_1.HEIC"], r"is not a scene: looked for poses_bounds\.npy"),
+    (["notes.txt", "._IMG_1.HEIC"], r"expected a scene, got another folder: there is no poses_bounds\.npy"),
     (["IMG_1.HEIC", "IMG_2.HEIC"], "2 HEIC photos that cannot be read: convert them"),
     (["a.dng", "b.avif", "c.AVIF"], "3 AVIF and DNG photos"),
     (["walk.MP4"], "1 MP4 videos: take photos out"),
