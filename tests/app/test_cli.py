@@ -121,7 +121,7 @@ def test_eval_refuses_measures_of_other_views(copied, capsys):
     metrics["test"]["views"][0]["name"] = "another"
     write_as_kgs(path, metrics)
     assert run("eval", copied) == 3
-    assert "has other views" in one_line(capsys)
+    assert ", got others: fit again" in one_line(capsys)
     assert json.loads(path.read_text()) == metrics
 
 
@@ -139,7 +139,7 @@ def test_a_fit_at_work_is_not_called_unfinished(folder, tmp_path, capsys):
     (tmp_path / UNFINISHED / CHECKPOINT).touch()
     with locked(tmp_path):
         assert run("fit", folder, "-o", tmp_path) == 3
-        assert "kgs is at work on the fit in this folder" in one_line(capsys)
+        assert "no kgs at work on the fit in this folder, got one" in one_line(capsys)
     assert run("fit", folder, "-o", tmp_path) == 3
     assert "go on with it by --resume, or remove this folder" in one_line(capsys)
 
@@ -201,7 +201,7 @@ def test_words_after_two_dashes_are_no_options(folder, tmp_path, capsys, monkeyp
     assert run("fit", "-o", "out", "--steps", 1, "--", "--help-all") == 3
     assert "--help-all: " in one_line(capsys)
     assert run("fit", "-o", "out", "--steps", 1, "--", "-h") == 3
-    assert "-h: no such file or folder" in one_line(capsys)
+    assert "-h: expected a file or folder, got none" in one_line(capsys)
 
 
 def test_versions(capsys, monkeypatch):

@@ -366,10 +366,10 @@ def test_a_file_that_the_user_writes_during_a_fit_is_not_replaced_and_no_trainin
 
     with monkeypatch.context() as patch:
         patch.setattr(Trainer, "_optimize", meanwhile)
-        with pytest.raises(DataError, match=f"holds {mine.name}, which this command did not write"):
+        with pytest.raises(DataError, match=f"got {mine.name}: move it away"):
             fit(scene, OTHER, done)
     assert json.loads((done / "metrics.json").read_text())["seed"] == 0
-    with pytest.raises(DataError, match=f"holds {mine.name}, which"):
+    with pytest.raises(DataError, match=f"got {mine.name}: move it away"):
         fit(scene, OTHER, done, resume=True)
     assert mine.read_text() == "mine"
     mine.unlink()

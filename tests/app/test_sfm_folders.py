@@ -68,7 +68,7 @@ def folder(tmp_path):
 VIDEO = b"\0\0\0\x18ftypisom" + bytes(100)
 FOLDERS = {  # what is in them, and what is said of it
     "notes": (lambda at: save(at, [], notes_txt=b"nothing"), ("expected photos", ".jpg", "Take 3 to 12 photos")),
-    "one": (lambda at: save(at, planes()[:1]), ("at least 3 photos, found 1", "Take 3 to 12")),
+    "one": (lambda at: save(at, planes()[:1]), ("at least 3 photos, got 1", "Take 3 to 12")),
     "too deep": (lambda at: save(at / "DCIM", planes()), ("these folders in it do: DCIM",)),
     "too deep, with cameras": (
         lambda at: save(save(at, [], transform_train_json=b"{}") / "images", planes()),
@@ -88,7 +88,7 @@ FOLDERS = {  # what is in them, and what is said of it
 REFUSED = {  # photos that can be read
     "one twice": (
         lambda at: save(at, [*planes()[:2], planes()[1]]),
-        ("2.png: is the same photo as 1.png: ",),
+        ("2.png: expected another photo than 1.png, got the same: ",),
     ),
     "cropped": (
         lambda at: save(at, [*planes()[:2], planes()[0][:120]]),

@@ -129,8 +129,8 @@ GOOD = handmade(FLOATS, [ROW])
 @pytest.mark.parametrize(
     ("data", "field", "reason"),
     [
-        (b"", "", "not a PLY file"),
-        (b"\x89PNG\r\n\x1a\n" + bytes(50), "", "not a PLY file"),
+        (b"", "", "expected a PLY file, got one without"),
+        (b"\x89PNG\r\n\x1a\n" + bytes(50), "", "expected a PLY file, got one without"),
         (b"ply\n", "header", "end_header"),
         (b"ply\n" + b"x" * 200_000, "header", "within 65536 bytes"),
         (b"ply\n" + b"comment long\n" * 10_000, "header", "within 65536 bytes"),
@@ -264,5 +264,5 @@ def test_ascii_positions_are_read_in_double_precision(tmp_path):
 
 def test_a_file_that_cannot_be_opened_is_a_data_error(tmp_path):
     for path in (tmp_path / "missing.ply", tmp_path):
-        with pytest.raises(DataError, match="cannot be read"):
+        with pytest.raises(DataError, match="expected a (file that can be read|PLY file, got a folder)"):
             load_ply(path)
