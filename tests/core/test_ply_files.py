@@ -154,7 +154,11 @@ GOOD = handmade(FLOATS, [ROW])
             "got",
         ),
         (handmade([], [], count=10**17), "x", "got none"),
-        (handmade([("packed_position", "uint"), ("packed_color", "uint")], [[1, 2]]), "", "the PLY that it was made from"),
+        (
+            handmade([("packed_position", "uint"), ("packed_color", "uint")], [[1, 2]]),
+            "",
+            "the PLY that it was made from",
+        ),
         (handmade(FLOATS, [ROW])[:-1], "vertex", "expected 68 bytes after the header, got 67"),
         (handmade(FLOATS, [ROW]) + b"\0", "vertex", "expected 68 bytes after the header, got 69"),
         (handmade(FLOATS, [ROW], after=[(["element e 1", "property int i"], b"\0")]), "vertex", "expected 72 bytes"),
