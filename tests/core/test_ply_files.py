@@ -157,7 +157,7 @@ GOOD = handmade(FLOATS, [ROW])
         (
             handmade([("packed_position", "uint"), ("packed_color", "uint")], [[1, 2]]),
             "",
-            "the PLY that it was made from",
+            "take the PLY",
         ),
         (handmade(FLOATS, [ROW])[:-1], "vertex", "expected 68 bytes after the header, got 67"),
         (handmade(FLOATS, [ROW]) + b"\0", "vertex", "expected 68 bytes after the header, got 69"),
