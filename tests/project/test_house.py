@@ -163,7 +163,7 @@ print(kgs._support.machine.peak_rss_mb())
 # -- errors --------------------------------------------------------------------------------------------------------
 
 PLAIN = {"kgs.drop", "kgs.reference"}  # import nothing of kgs
-PLAIN |= {"kgs._support.json_files"}  # whose readers turn them into DataErrors
+PLAIN |= {"kgs._support.json_files", "kgs.datasets.image_file"}  # whose readers turn them into DataErrors
 
 
 def test_a_wrong_value_is_an_argument_error():
