@@ -7,10 +7,11 @@ under "state", next to the format and the SHA-256 of tensors and JSON. Loading m
 import hashlib
 import json
 import os
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from functools import reduce
 from operator import getitem
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from kgs._support.errors import DataError, quoted
+from kgs._support.errors import ArgumentError, DataError, quoted
 from kgs._support.json_files import parse_json
 
 from .state import digest
@@ -111,6 +112,15 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     if not isinstance(state, dict):
         raise DataError(path, "state", "a dict", f"a {type(state).__name__}")
     return state
+
+
+@contextmanager
+def errors_of(path: str | PathLike[str]) -> Iterator[None]:
+    """Turn an ArgumentError, which names an entry, into an error about this file."""
+    try:
+        yield
+    except ArgumentError as error:
+        raise error.about(path) from error
 
 
 def _digest_all(text: str, tensors: Mapping[str, Tensor]) -> str:
