@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from refusals import refused
 
 from kgs._support.errors import DataError
 from kgs.app.saved_fit import read_request
