@@ -153,7 +153,7 @@ def test_of_a_photo_of_another_shape_the_middle_is_taken(tmp_path):
     cv2.imwrite(str(tmp_path / "masks" / "IMG_5.png"), mask)
     photos = read_photos(opened(tmp_path, images, films), silent)
     assert [photo.size for photo in photos] == [photos[0].size] * 7
-    assert [photo.whole is None for photo in photos] == [True] * 3 + [False] * 4
+    assert [photo.is_cut for photo in photos] == [False] * 3 + [True] * 4
     assert len({photo.lens for photo in photos[:3]}) == 1
     assert len({photo.lens for photo in photos}) == 4  # 240x120 is there upright and lying
     width, height = photos[0].size

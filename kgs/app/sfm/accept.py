@@ -23,8 +23,8 @@ from kgs._support.progress import ProgressBar
 from kgs.geometry import degrees_between
 
 from .find import MIN_PHOTOS
-from .map import Cameras, Solver, quiet_pycolmap
-from .match import colmap_matching, exif_focals, write_matches
+from .map import Cameras, Solver
+from .match import colmap_matching, lenses_of, write_matches
 from .pairs import (
     FEWER,
     MIN_MATCHES,
@@ -105,11 +105,12 @@ def accepted_cameras(
     """
     folder = photos[0].path.parent
     size = photos[0].size
+    lenses = lenses_of(photos)
     first, second = (Solver(work / f"{name}.db", images, work / name, seed) for name in ("first", "second"))
-    with quiet_pycolmap(), ThreadPoolExecutor(1) as executor, PycolmapProcesses() as processes:
-        matching = colmap_matching(photos, images, masks, work, list(names))
+    with ThreadPoolExecutor(1) as executor, PycolmapProcesses() as processes:
+        matching = colmap_matching(photos, lenses, images, masks, work, list(names))
         second_matches = executor.submit(processes.run, "write_colmap_matches", second.database, seed=seed, **matching)
-        write_matches(first.database, photos, list(names), bar)
+        write_matches(first.database, photos, list(names), lenses, bar)
         processes.run("verify", first.database, seed=seed)
         matches = {(names[a], names[b]): found for (a, b), found in verified_matches(first.database).items()}
         pairs = {pair: len(found) for pair, (found, _) in matches.items()}
@@ -120,8 +121,8 @@ def accepted_cameras(
         kept = {image: name for image, name in names.items() if name not in rejected}
         if reason := why_no_cameras(list(kept.values()), pairs, geometries):
             raise PhotosRefused(folder, "", reason)
-        focals = [focal for focal in exif_focals(photos) if focal]
-        known = focals if len(focals) == len(exif_focals(photos)) else []
+        are_known = all(lens.has_prior_focal_length for lens in lenses)
+        known = [lens.focal_length for lens in lenses] if are_known else []
         consensus = Consensus((first, second), second_matches, executor, known, pairs)
         solutions, held = consensus.solve(kept)
         while more := without_cameras(solutions, list(kept.values()), pairs):
