@@ -77,6 +77,27 @@ def test_a_focal_length_in_millimetres_counts_where_the_density_of_pixels_is_kno
     assert read_exif(tmp_path, with_exif(JPEG, exif(focal=5))).focal_ratio(4000, 3000) is None
 
 
+@pytest.mark.parametrize(
+    ("film", "over_width", "expected"),
+    [
+        (28, None, 28 / 36),
+        (1, None, None),
+        (7, None, None),
+        (8, None, 8 / 36),  # a fisheye
+        (360, None, 10),
+        (720, None, None),
+        (None, 0.1, None),  # of a sensor of another size
+        (None, 20, None),
+        (1, 0.8, 0.8),
+    ],
+)
+def test_a_focal_length_that_no_lens_has_is_passed_over(tmp_path, film, over_width, expected):
+    (photo,) = opened(tmp_path, planes()[:1], [0])
+    photo = photo._replace(exif=Exif(1, film, over_width), size=(3600, 2400))
+    assert photo.focal_ratio == (expected and pytest.approx(expected))
+    assert photo.has_odd_focal == (expected is None)
+
+
 def test_nothing_and_damage_are_no_metadata(tmp_path):
     block = exif(orientation=6, film=28, focal=5, density=5000, width=4000)
     whole = read_exif(tmp_path, with_exif(JPEG, block))

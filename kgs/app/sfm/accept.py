@@ -30,12 +30,12 @@ from .pairs import (
     MIN_MATCHES,
     Pairs,
     gap,
-    missing_link,
     pair_geometry,
     table,
     verified_matches,
     weakest_link,
     went_forward,
+    what_would_help,
     why_no_cameras,
     without_overlap,
 )
@@ -55,7 +55,7 @@ _UNTOLD = "the photos do not tell the focal length, and their Exif does not say 
 _FORWARD = (
     "The camera moved along its view, as when walking forward: what lies ahead hardly moves between such photos, and "
     "nothing tells how far away it is. What helps most: step sideways, not forward, so that neighbours are 3 to 20 "
-    f"degrees apart. {FEWER}"
+    f"degrees apart.\n{FEWER}"
 )
 _APART = (
     "As a rule they are too close together. What helps: larger steps to the side or up, so that neighbours are 3 to 20 "
@@ -281,7 +281,7 @@ def _registered_badly(first: Cameras, second: Cameras, names: Sequence[str], pai
     registered = [name for name in names if name in first.points and name in second.points]
     better = max((first, second), key=lambda found: _worst_seen(found, registered))
     for name in names:
-        advice = missing_link(name, [other for other in names if other != name], pairs)
+        advice = what_would_help(name, [other for other in names if other != name], pairs)
         if name not in registered:
             who = "only one" if name in first.points or name in second.points else "neither"
             left[name] = f"{who} of two solvers could place it{advice}"
@@ -345,7 +345,7 @@ def check(
     """
 
     def refuse(reason: str, advice: str) -> NoReturn:
-        said = f"no cameras that can be trusted: {reason}. {_FORWARD if forward else advice}"
+        said = f"no cameras that can be trusted: {reason}.\n{_FORWARD if forward else advice}"
         raise PhotosRefused(folder, "", f"{said}.\n{table(names, pairs)}")
 
     missing = [name for name in names if any(name not in cameras.points for cameras in solutions)]
@@ -354,7 +354,7 @@ def check(
     beside = (
         f"What helps most: photos from places between {' and '.join(between)}, with steps to the side or up (turning "
         "on the spot shows no depth), so that neighbours share two thirds of the scene; a scene with texture; all with "
-        f"one lens, without zoom. {FEWER}"
+        f"one lens, without zoom.\n{FEWER}"
     )
     reasons = [objections(cameras, names, longest) for cameras in solutions]
     good = [i for i, objection in enumerate(reasons) if not objection]

@@ -218,6 +218,8 @@ def _say_notes(opened: list[OpenPhoto], photos: list[Photo], unsharp: list[str],
             say(f"{photo.name}: only its middle is taken, because it has another shape than most photos")
     for note in color_notes([photo.image for photo in opened]):
         say(note)
+    if odd := [photo.name for photo in opened if photo.has_odd_focal]:
+        say(f"a focal length in the Exif that no lens has is passed over: {', '.join(odd)}")
     if unsharp:
         say(f"blurred beside the others: {', '.join(unsharp)}; if the fit shows it, take them again")
 

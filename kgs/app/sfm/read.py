@@ -35,6 +35,7 @@ _PIXELS_X = 0xA002
 _DENSITY = 0xA20E
 _DENSITY_UNIT = 0xA210
 _UNITS = {2: 25.4, 3: 10.0, 4: 1.0}  # mm, in which the density of pixels is given
+_LENSES = 0.2, 10.0  # focal lengths over the longer side: a fisheye of 8 mm, a telephoto lens of 360 mm
 _PANORAMA = b"equirectangular"  # in XMP, https://developers.google.com/streetview/spherical-metadata
 _SEAM = 2.0  # how much more than neighbouring columns the first and the last one of a panorama may differ
 _SAME_ZOOM = 1.1  # largest ratio of focal lengths that counts as one lens without zoom
@@ -70,11 +71,11 @@ class Exif(NamedTuple):
         return self.orientation > 4
 
     def focal_ratio(self, width: int, height: int) -> float | None:
-        """The focal length over the longer side of a photo of this shape, or None."""
-        if self.focal_35mm:
-            return self.focal_35mm / FILM_DIAGONAL * math.hypot(width, height) / max(width, height)
+        """The focal length over the longer side of a photo of this shape; None if there is none that a lens has."""
         stored = height if self.is_sideways else width
-        return self.focal_over_width * stored / max(width, height) if self.focal_over_width else None
+        over_film = (self.focal_35mm or 0.0) / FILM_DIAGONAL * math.hypot(width, height) / max(width, height)
+        over_sensor = (self.focal_over_width or 0.0) * stored / max(width, height)
+        return next((ratio for ratio in (over_film, over_sensor) if _LENSES[0] <= ratio <= _LENSES[1]), None)
 
 
 def _number(tags: Mapping[int, Any], tag: int) -> float:
@@ -120,6 +121,11 @@ class OpenPhoto(NamedTuple):
     def focal_ratio(self) -> float | None:
         """The focal length over the longer side that Exif gives, None if it does not."""
         return self.exif.focal_ratio(*self.size)
+
+    @property
+    def has_odd_focal(self) -> bool:
+        """Whether the Exif gives focal lengths, none of which a lens has."""
+        return bool(self.exif.focal_35mm or self.exif.focal_over_width) and not self.focal_ratio
 
 
 @dataclass(frozen=True, eq=False)
