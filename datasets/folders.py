@@ -162,7 +162,8 @@ def no_scene(root: Path) -> DataError:
     if folder := scene_nearby(root):
         return DataError(root, "", "a scene", got, advice=f"{folder} is one: give that folder")
     if not root.is_dir():
-        return DataError(root, "", "a folder", "a file")
+        meant = f"for photos, name their folder: {root.parent}" if root.suffix.lower() in PICTURE_SUFFIXES else ""
+        return DataError(root, "", "a folder", "a file", advice=meant)
     advice = f"there is no {', '.join(LAYOUT_FILES.values())} or COLMAP model in sparse/0"
     if count := len(list_images(image_folder(root) or root, PICTURE_SUFFIXES)):
         got = f"{quantity(count, 'photo')} without camera poses"

@@ -253,9 +253,9 @@ def _check_size(path: Path, width: int, height: int, size: int) -> None:
         raise DataError(path, "header", "an image of at least 1x1 pixels", f"{width}x{height}")
     # Photos have fewer than 20 pixels per byte, a PNG of one colour 1032. Any file may have 2^21 pixels (48 MiB while
     # decoded); images of one colour may have 2^24 (384 MiB). More, up to 2^28, need a byte for every 32.
-    most = min(2**28, max(2**21, min(2**24, 2048 * size), 32 * size))
-    if width * height > most:
-        expected = f"at most {most} pixels in {size} bytes"
+    max_pixels = min(2**28, max(2**21, min(2**24, 2048 * size), 32 * size))
+    if width * height > max_pixels:
+        expected = f"at most {max_pixels} pixels in {size} bytes"
         raise DataError(path, "header", expected, f"{width}x{height}", advice="it is a decompression bomb")
 
 

@@ -130,7 +130,7 @@ def test_resume_of_a_finished_fit_changes_nothing_and_with_other_numbers_is_refu
     assert run("fit", folder, "-o", fitted, *FIT, "--resume") == 0
     capsys.readouterr()
     assert run("fit", folder, "-o", fitted, *FIT, "--seed", 1, "--resume") == 3
-    assert "--seed: expected 0" in one_line(capsys)
+    assert "safetensors: seed: expected 0" in one_line(capsys)
     assert (fitted / "splat.ply").read_bytes() == before
 
 

@@ -69,20 +69,23 @@ VIDEO = b"\0\0\0\x18ftypisom" + bytes(100)
 FOLDERS = {  # what is in them, and what is said of it
     "notes": (lambda at: save(at, [], notes_txt=b"nothing"), ("expected photos", ".jpg", "Take 3 to 12 photos")),
     "one": (lambda at: save(at, planes()[:1]), ("at least 3 photos, got 1", "Take 3 to 12")),
-    "too deep": (lambda at: save(at / "DCIM", planes()), ("these folders in it do: DCIM",)),
+    "too deep": (lambda at: save(at / "DCIM", planes()), ("these folders in it hold some: DCIM",)),
     "too deep, with cameras": (
         lambda at: save(save(at, [], transform_train_json=b"{}") / "images", planes()),
-        ("these folders in it do: images", "transform_train.json"),
+        ("these folders in it hold some: images", "transform_train.json"),
     ),
     "raw": (
         lambda at: save(at, planes(), raw_dng=b"II*\0"),
         ("got 1 of 4 of another kind (raw.dng)", "sips", "magick", "Most Compatible"),
     ),
-    "video called JPEG": (lambda at: save(at, planes(), z_jpg=VIDEO), ("z.jpg: is a HEIC photo or a video", "sips")),
+    "video called JPEG": (
+        lambda at: save(at, planes(), z_jpg=VIDEO),
+        ("z.jpg: expected a photo, got a HEIC", "sips"),
+    ),
     "empty": (lambda at: save(at, planes(), z_jpg=b""), ("z.jpg: expected an image, got an empty file",)),
     "videos": (
         lambda at: save(at, [], clip_MOV=VIDEO, other_mp4=VIDEO),
-        ("several videos (clip.MOV, other.mp4): name one",),
+        ("got videos (clip.MOV, other.mp4): name one",),
     ),
 }
 REFUSED = {  # photos that can be read
@@ -315,11 +318,11 @@ def test_results_do_not_go_among_the_photos_or_over_another_scene(folder, tmp_pa
     (tmp_path / "scene" / "sparse" / "images.bin").write_bytes(b"mine")
     save(tmp_path / "other" / "images", planes())
     for out, said in (
-        (folder, "another folder than that of the photos"),
+        (folder, "of the photos|photos or files of a scene"),
         (tmp_path / "scene", "files of a scene"),
         (tmp_path / "other", "did not write"),
     ):
-        refused(folder, said, out=out, code=3)
+        refused(folder, "expected", out=out, code=3)
         with pytest.raises(DataError, match=said):
             pose_photos(folder, out)
 
