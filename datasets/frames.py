@@ -46,16 +46,16 @@ class Frame:
         center = self.pose[:3, 3]
         numbers = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
         if not np.isfinite(numbers).all():
-            raise wrong("expected finite intrinsics, got NaN or infinity")
+            raise wrong("finite intrinsics", "NaN or infinity")
         if not min(lens.width, lens.height) >= 1:
-            raise wrong(f"expected an image size above 0, got {lens.width}x{lens.height}")
+            raise wrong("an image size above 0", f"{lens.width}x{lens.height}")
         if not (lens.fx >= SHORTEST_FOCAL * lens.width and lens.fy >= SHORTEST_FOCAL * lens.height):
             got = f"{lens.fx:g} and {lens.fy:g} for {lens.width}x{lens.height}"
-            raise wrong(f"expected focal lengths in pixels, at least a tenth of the sides, got {got}")
+            raise wrong("focal lengths in pixels, at least a tenth of the sides", got)
         if self.pose.shape != (4, 4) or not bool(torch.isfinite(self.pose).all()):
-            raise wrong("expected a finite 4x4 pose")
+            raise wrong("a finite 4x4 pose")
         if max(lens.width, lens.height, *map(abs, numbers), float(center.abs().max())) > LARGEST:
-            raise wrong(f"expected intrinsics and a camera centre up to {LARGEST:g}")
+            raise wrong(f"intrinsics and a camera centre up to {LARGEST:g}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,10 +90,11 @@ def check_rotation(source: Path, name: str, pose: Tensor) -> None:
     square = float(products.diagonal().mean())  # of the length of an axis
     error = float((products / square - torch.eye(3, dtype=axes.dtype)).abs().max())
     if not (error <= _ROUNDED and float(torch.linalg.det(axes)) > 0):  # the products may be NaN
-        raise DataError(source, name, f"expected a right-handed rotation, got {axes.tolist()}")
+        raise DataError(source, name, "a right-handed rotation", str(axes.tolist()))
     if abs(square - 1) > _ROUNDED:
-        reason = f"expected a rotation, got one scaled by {math.sqrt(square):.4g}: divide it by that"
-        raise DataError(source, name, reason)
+        raise DataError(
+            source, name, "a rotation", f"one scaled by {math.sqrt(square):.4g}", advice="divide it by that"
+        )
 
 
 def path_inside(source: Path, root: Path, name: str, folder: Path | None = None) -> Path:
@@ -101,15 +102,15 @@ def path_inside(source: Path, root: Path, name: str, folder: Path | None = None)
     wrong = partial(DataError, source, repr(name[:200]))
     given = PureWindowsPath(name)  # knows both separators and drives; a file may have backslashes in its name, too
     if not name or "\0" in name or given.drive or given.root or ".." in given.parts:
-        raise wrong("expected the name of a file inside the scene's folder")
+        raise wrong("the name of a file inside the scene's folder")
     folder = folder or root
     try:
         path = folder / name if (folder / name).is_file() else folder / given.as_posix()
         target = Path(os.path.realpath(path))
     except (OSError, ValueError) as error:  # too long, or not to be written in the file system's encoding
-        raise wrong(f"expected the name of a file, got an impossible one ({error})") from error
+        raise wrong("the name of a file", "an impossible one", advice=str(error)) from error
     if not target.is_relative_to(os.path.realpath(root)):
-        raise wrong("expected a file inside the scene's folder, got a link that leads out")
+        raise wrong("a file inside the scene's folder", "a link that leads out")
     return path
 
 

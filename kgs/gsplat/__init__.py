@@ -145,10 +145,19 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
     options = dataclasses.replace(options, tile_size=None, far_plane=math.inf if endless else options.far_plane)
     has_image = "RGB" in render_mode
     gaussians, cameras, features_per_camera = as_kgs(
-        *(means, quats, scales, covars, opacities),
-        *((colors, sh_degree) if has_image else (None, None)),
-        *(viewmats, Ks, (height, width), camera_model, pixel_centers),
+        means,
+        quats,
+        scales,
+        covars,
+        opacities,
+        colors,
+        viewmats,
+        Ks,
+        size=(height, width),
+        lens=camera_model,
+        pixel_centers=pixel_centers,
         has_image=has_image,
+        sh_degree=sh_degree,
     )
     is_shared = has_image and features_per_camera is None
     projected = project(gaussians, cameras, options=options, colors=is_shared, backend=backend)

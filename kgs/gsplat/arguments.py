@@ -9,7 +9,7 @@ from kornia.image import ImageSize
 from kornia.sensors.camera import CameraModel, CameraModelType
 from torch import Tensor
 
-from kgs._support.errors import ArgumentError
+from kgs._support.errors import ArgumentError, quoted
 from kgs.camera import Cameras, PosedCamera, pinhole_cameras
 from kgs.covariance import covariance_factors
 from kgs.types import SH_SIZES, Gaussians, check_tensor
@@ -50,9 +50,9 @@ def refuse(given: dict[str, Any]) -> None:
         if name == "rolling_shutter" and getattr(value, "name", None) == "GLOBAL":
             continue
         if hasattr(value, "shape"):
-            raise ArgumentError(f"{name}: expected {default!r} ({why}), got an array {tuple(value.shape)}")
+            raise ArgumentError(name, f"{default!r} ({why})", f"an array {tuple(value.shape)}")
         if value != default:
-            raise ArgumentError(f"{name}: expected {default!r} ({why}), got {value!r}")
+            raise ArgumentError(name, f"{default!r} ({why})", quoted(value))
 
 
 def check_words(render_mode: str, rasterize_mode: str, camera_model: str, sh_degree: Any) -> None:
@@ -60,10 +60,10 @@ def check_words(render_mode: str, rasterize_mode: str, camera_model: str, sh_deg
     given = {"render_mode": render_mode, "rasterize_mode": rasterize_mode, "camera_model": camera_model}
     for name, known in _WORDS.items():
         if given[name] not in known:
-            raise ArgumentError(f"{name}: expected one of {known}, got {given[name]!r}")
+            raise ArgumentError(name, f"one of {known}", quoted(given[name]))
     if camera_model == "ortho" and sh_degree:
         why = "gsplat takes directions from the centre, kgs along the rays"
-        raise ArgumentError(f"sh_degree: expected None or 0 with camera_model 'ortho' ({why}), got {sh_degree!r}")
+        raise ArgumentError("sh_degree", f"None or 0 with camera_model 'ortho' ({why})", sh_degree)
 
 
 def as_kgs(
@@ -73,19 +73,20 @@ def as_kgs(
     covars: Tensor | None,
     opacities: Tensor,
     colors: Tensor | None,
-    sh_degree: int | None,
     viewmats: Tensor,
     intrinsics: Tensor,
+    *,
     size: tuple[int, int],
     lens: str,
     pixel_centers: str,
     has_image: bool,
+    sh_degree: int | None,
 ) -> tuple[Gaussians, Cameras, Tensor | None]:
     """The Gaussians, the cameras, and features `(C, N, D)` where each camera has its own."""
     n = _length("means", means, (3,), means)
     count = _length("viewmats", viewmats, (4, 4), means)
     if not count:
-        raise ArgumentError(f"viewmats: expected at least one camera, got shape {tuple(viewmats.shape)}")
+        raise ArgumentError("viewmats", "at least one camera", f"shape {tuple(viewmats.shape)}")
     check = partial(_checked, like=means)
     if covars is None:
         quats = check("quats", quats, (n, 4))
@@ -118,7 +119,7 @@ def _length(name: str, value: Any, ends: tuple[int, ...], like: Any) -> int:
     check_tensor(name, value, like if isinstance(like, Tensor) else None, " as means")
     if tuple(value.shape[1:]) != ends:
         expected = f"({'N' if name == 'means' else 'C'}, {', '.join(map(str, ends))})"
-        raise ArgumentError(f"{name}: expected shape {expected}, of one scene, got {tuple(value.shape)}")
+        raise ArgumentError(name, f"shape {expected}, of one scene", tuple(value.shape))
     return int(value.shape[0])
 
 
@@ -126,8 +127,7 @@ def _checked(name: str, value: Any, *shapes: tuple[int, ...], like: Tensor) -> T
     """A tensor of one of some shapes; a TypeError or ValueError for anything else."""
     check_tensor(name, value, like, " as means")
     if tuple(value.shape) not in shapes:
-        expected = " or ".join(map(str, shapes))
-        raise ArgumentError(f"{name}: expected shape {expected}, got {tuple(value.shape)}")
+        raise ArgumentError(name, f"shape {' or '.join(map(str, shapes))}", tuple(value.shape))
     tensor: Tensor = value
     return tensor
 
@@ -135,13 +135,13 @@ def _checked(name: str, value: Any, *shapes: tuple[int, ...], like: Tensor) -> T
 def _harmonics(colors: Any, sh_degree: Any, n: int, like: Tensor) -> Tensor:
     """The harmonics that are used, `(N, K, 3)`."""
     if not isinstance(sh_degree, int | np.integer) or sh_degree not in range(len(SH_SIZES)):
-        raise ArgumentError(f"sh_degree: expected 0 to {len(SH_SIZES) - 1} or None, got {sh_degree!r}")
+        raise ArgumentError("sh_degree", f"0 to {len(SH_SIZES) - 1} or None", quoted(sh_degree))
     check_tensor("colors", colors, like, " as means")
     minimum = SH_SIZES[sh_degree]
     shape = tuple(colors.shape)
     if len(shape) != 3 or shape[0] != n or shape[1] < minimum or shape[2] != 3:
         expected = f"({n}, K, 3) with K >= {minimum} for sh_degree {sh_degree}"
-        raise ArgumentError(f"colors: expected shape {expected}, got {shape}")
+        raise ArgumentError("colors", f"shape {expected}", shape)
     used: Tensor = colors[:, :minimum]
     return used
 
