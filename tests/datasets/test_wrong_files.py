@@ -251,7 +251,7 @@ NERFSTUDIO = [
         ]
     ],
     (NERFSTUDIO_FILE, top(w=12, h=16), "images/1.png: "),
-    ("images/1.png", sideways, "images/1.png: has 12x16 pixels, which is not a scaled version of"),
+    ("images/1.png", sideways, "images/1.png: expected a scaled version of the 16x12 that"),
     (NERFSTUDIO_FILE, frame(camera_model="OPENCV_FISHEYE", is_fisheye=False), f"{NERFSTUDIO_FILE}: is_fisheye of"),
     (NERFSTUDIO_FILE, frame(camera_model="OPENCV_FISHEYE", p1=0.01), f"{NERFSTUDIO_FILE}: p1 of images/2.png"),
 ]
