@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command import one_line, run
 
 from kgs._support.errors import DataError
 from kgs._support.json_files import write_json
@@ -398,44 +397,3 @@ def test_a_damaged_move_removes_nothing(out: Path, move: Any) -> None:
     write_json(out / UNFINISHED / MARKER, {"files": {}, "move": move})
     complete(out)
     assert contents(out) == OLD | {f"{UNFINISHED}/thesis.txt": "mine"}
-
-
-@pytest.mark.parametrize("name", ["speed", "precision", "extremes"])
-def test_benchmarks_follow_the_same_rules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    monkeypatch.setattr(f"kgs.bench.{name}.{name}", lambda out, **_: (out / f"{name}.md").write_text("new") and 0)
-    out = tmp_path / "new"
-    for _ in range(2):
-        assert run("bench", name, "-o", out) == 0
-    assert contents(out) == {f"{name}.md": "new"}
-
-
-BY = "--by 0,0,0 1,0,0 2"
-
-
-@pytest.mark.parametrize("is_of_another_command", [False, True])
-@pytest.mark.parametrize(
-    ("words", "name"),
-    [
-        ("fit {scene} -o {out}", "splat.ply"),
-        ("demo -o {out} --size 32", "splat.ply"),
-        ("export {fit}/splat.ply -o {out}/a.ply", "a.ply"),
-        ("clean {fit}/splat.ply -o {out}/a.ply", "a.ply"),
-        (f"scale {{fit}}/splat.ply {BY} -o {{out}}/a.ply", "a.ply"),
-        (f"scale {{fit}} {BY} -o {{out}}", "splat.ply"),
-        ("page {fit}/splat.ply --cameras {scene} -o {out}/a.html", "a.html"),
-        ("render {fit}/splat.ply --cameras {scene} -o {out}", "train_r_0.png"),
-        *((f"bench {name} -o {{out}}", f"{name}.md") for name in ("speed", "precision", "extremes")),
-    ],
-)
-def test_no_command_replaces_a_file_of_the_user_or_of_another_command(
-    folder: Path, fitted: Path, tmp_path: Path, capsys: Any, words: str, name: str, is_of_another_command: bool
-) -> None:
-    if is_of_another_command:
-        with replacing(tmp_path, "other") as new:
-            write(new, {name: "mine"})
-    else:
-        write(tmp_path, {name: "mine"})
-    given = [word.format(scene=folder, fit=fitted, out=tmp_path) for word in words.split()]
-    assert run(*given) == 3
-    assert f"holds {name}, which this command did not write" in one_line(capsys)
-    assert contents(tmp_path) == {name: "mine"}

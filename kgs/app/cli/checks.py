@@ -8,6 +8,7 @@ from kgs.datasets.options import held_out_between_ends
 from kgs.datasets.source import SceneSource
 
 SMALLEST = 32  # pixels of the longer side of a fit's photos
+_HEAD = 4096  # bytes, enough for the header of any splat
 
 
 def check_roll(roll: float) -> None:
@@ -22,12 +23,12 @@ def check_side(size: int) -> None:
         raise ArgumentError(f"size: expected at least {SMALLEST} pixels, got {size}")
 
 
-def check_file(out: Path, ending: str, kind: str, source: Path | None = None) -> None:
+def check_file(out: Path, ending: str, source: Path | None = None) -> None:
     """Raise a ValueError or DataError unless a command can write its result to this file, which is not `source`.
 
-    `kind` is that of :func:`kgs.app.files.publishing.replacing`.
+    A file that is there is replaced if kgs wrote it, and if it is none of the results of a fit.
     """
-    from kgs.app.files.publishing import check_free
+    from kgs.app.files.results import read_marker
 
     if out.suffix.lower() != ending:
         raise ArgumentError(f"out: expected a file that ends in {ending}, got {str(out)!r}")
@@ -37,7 +38,19 @@ def check_file(out: Path, ending: str, kind: str, source: Path | None = None) ->
         raise ArgumentError(f"out: expected another file than {str(source)!r}, which is read")
     if not out.absolute().parent.is_dir():
         raise DataError(out, "", "no such folder to write it to")
-    check_free(out.parent, kind, [out.name])
+    if out.exists() and not _is_of_kgs(out):
+        raise DataError(out, "", "expected a new file or one that kgs wrote, got another: choose another name")
+    results = read_marker(out.parent)
+    if any(out.name in results.get(kind, []) for kind in ("fit", "scale")):
+        raise DataError(out, "", "belongs to the results in this folder: choose another name")
+
+
+def _is_of_kgs(path: Path) -> bool:
+    """Whether a file begins as the splats and pages that kgs writes."""
+    with path.open("rb") as file:
+        head = file.read(_HEAD)
+    is_splat = head.startswith(b"ply\n") and any(word in head for word in (b"\ncomment kgs ", b" packed_position\n"))
+    return is_splat or b'<meta name="generator" content="made by kgs ' in head
 
 
 def check_photos_of(source: SceneSource) -> None:
@@ -48,20 +61,16 @@ def check_photos_of(source: SceneSource) -> None:
 
 
 def check_results(out: Path) -> None:
-    """Raise a DataError unless this is the folder of the results of a fit."""
-    from kgs._support.json_files import read_json
-    from kgs.app.files.locks import locked
-    from kgs.app.files.publishing import UNFINISHED, complete
-    from kgs.app.files.results_folder import has_fit
+    """Raise a DataError unless this is the folder of the results of a fit; end what a kill left of a move there."""
+    from kgs.app.files.fit_files import has_fit
+    from kgs.app.files.results import UNFINISHED, complete
 
     complete(out)
     config = out / "config.json"
     if not config.exists() and has_fit(out / UNFINISHED):
-        with locked(out):  # or it is at work
-            raise DataError(out, "", "holds a fit that is not done: kgs fit --resume goes on with it")
+        raise DataError(out, "", "holds a fit that is not done: kgs fit --resume goes on with it")
     if not config.exists():
         raise DataError(config, "", "cannot be read: expected the folder of the results of kgs fit")
-    read_json(config)
 
 
 def check_photos(
