@@ -22,11 +22,10 @@ if TYPE_CHECKING:
     from filelock import BaseFileLock
 
 MARKER = ".kgs.json"
-UNFINISHED = "unfinished"  # the folder of new fits and cameras, which outlives a kill
+UNFINISHED = "unfinished"  # the folder of a new fit and its cameras
 _LOCK = ".kgs.lock"
-_NEW = ".kgs-new"  # the folder of other new results
+_NEW = ".kgs-new"  # of other new results
 _WHOLE = ".kgs-whole"
-_MAX_NAMED = 10  # files in a line
 
 
 class Results:
@@ -34,7 +33,7 @@ class Results:
 
     def __init__(self, out: Path, kind: str) -> None:
         self.out = out
-        self.work = out / UNFINISHED  # of a new fit and its cameras
+        self.work = out / UNFINISHED
         self._kind = kind
         self._is_new = not out.exists()
         self._lock: BaseFileLock | None = None
@@ -58,15 +57,13 @@ class Results:
         """
         _check_folder(out, {MARKER, *marks})
         if others := sorted(set(read_marker(out)).difference([kind, *beside])):
-            reason = f"expected a folder for {kind}, got one of kgs with {' and '.join(others)}: choose another"
-            raise DataError(out, "", reason)
+            raise DataError(out, "", f"expected a folder for {kind}, got one of kgs with {' and '.join(others)}")
         results = cls(out, kind)
         try:
             if (out / MARKER).exists():
                 results.begin()
             if not resume and has_fit(results.work):
-                reason = "holds a fit that is not done: go on with it by --resume, or remove this folder"
-                raise DataError(results.work, "", reason)
+                raise DataError(results.work, "", "holds a fit that is not done: use --resume, or remove this folder")
             yield results
         finally:
             results._close()
@@ -82,8 +79,7 @@ class Results:
         try:
             lock.acquire(timeout=0)
         except Timeout as error:
-            reason = "kgs is at work in this folder: wait for it or choose another folder"
-            raise DataError(self.out, "", reason) from error
+            raise DataError(self.out, "", "kgs is at work in this folder: wait for it, or choose another") from error
         self._lock = lock
         if not (self.out / MARKER).exists():
             write_json(self.out / MARKER, {"files": {}})
@@ -186,8 +182,7 @@ def _check_folder(out: Path, marks: set[str]) -> None:
         raise DataError(out, "", f"results cannot be written there: no permission for {there}")
     names = sorted(path.name for path in out.iterdir() if path.name != _LOCK) if out.is_dir() else []
     if names and marks.isdisjoint(names):
-        got = f"one with {listed(names, _MAX_NAMED)}"
-        raise DataError(out, "", f"expected a new or empty folder for results, or one with results of kgs, got {got}")
+        raise DataError(out, "", f"expected a new or empty folder, or one of kgs, got one with {listed(names, 10)}")
 
 
 def _files_in(folder: Path, patterns: Iterable[str] = ("*",)) -> list[str]:
