@@ -88,12 +88,9 @@ class SceneRequest:
 
     def shrink(self, scene: "Scene") -> float:
         """By what factor the photos of `scene` are smaller than the largest that its folder has."""
-        from kgs.datasets.load import load_scene
-
         factor = self.downscale or 1.0
         if self.photo_folder:
-            largest = load_scene(scene.root, photos=False, hold_out=0).train.images.shape[-1]
-            factor *= largest / scene.train.images.shape[-1]
+            factor *= max(SceneSource(scene.root).photo_size()) / max(scene.train.images.shape[-2:])
         return factor
 
     def to_dict(self) -> dict[str, Any]:

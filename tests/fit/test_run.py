@@ -8,11 +8,10 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from fits_in_folders import fit_in
 
 from kgs._support.errors import DataError
-from kgs.app import fit_folder as app
-from kgs.app.files.publishing import UNFINISHED
-from kgs.app.files.results_folder import CHECKPOINT
+from kgs.app.files.fit_files import CHECKPOINT, UNFINISHED
 from kgs.app.scene_request import SceneRequest
 from kgs.app.training import Training
 from kgs.fit.checkpoint import load_checkpoint, previous
@@ -32,7 +31,7 @@ def _few_points(points):
 def fit_folder(scene, config, out, lines=None, **options):
     """Fit; the lines that are said are added to `lines`."""
     say = ([] if lines is None else lines).append
-    return app.fit_folder(scene, config, out, SceneRequest("/photos"), say=say, **options)
+    return fit_in(scene, config, out, SceneRequest("/photos"), say=say, **options)
 
 
 @pytest.fixture(scope="module")

@@ -1,11 +1,15 @@
 """Checks of options that need no torch: a command calls them first, because torch takes seconds to load."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from kgs._support.errors import ArgumentError, DataError
 from kgs.datasets.folders import has_photos
 from kgs.datasets.options import held_out_between_ends
 from kgs.datasets.source import SceneSource
+
+if TYPE_CHECKING:
+    from kgs.app.source import Source
 
 SMALLEST = 32  # pixels of the longer side of a fit's photos
 _HEAD = 4096  # bytes, enough for the header of any splat
@@ -62,8 +66,8 @@ def check_photos_of(source: SceneSource) -> None:
 
 def check_results(out: Path) -> None:
     """Raise a DataError unless this is the folder of the results of a fit; end what a kill left of a move there."""
-    from kgs.app.files.fit_files import has_fit
-    from kgs.app.files.results import UNFINISHED, complete
+    from kgs.app.files.fit_files import UNFINISHED, has_fit
+    from kgs.app.files.results import complete
 
     complete(out)
     config = out / "config.json"
@@ -73,9 +77,25 @@ def check_results(out: Path) -> None:
         raise DataError(config, "", "cannot be read: expected the folder of the results of kgs fit")
 
 
+def check_init(init: str, source: "Source") -> None:
+    """Raise an ArgumentError unless a fit can begin with these initial points."""
+    if init == "scene" and (source.scene is None or source.scene.layout != "Blender"):
+        kind = "photos without camera poses" if source.scene is None else f"the layout {source.scene.layout}"
+        raise ArgumentError(f"init: expected another one for {kind}, got 'scene', Blender's points")
+
+
+def check_frames(frames: int | None, source: "Source") -> None:
+    """Raise an ArgumentError unless so many frames can be taken from a video."""
+    from kgs.app.sfm.find import MIN_PHOTOS
+
+    if frames is not None and frames < MIN_PHOTOS:
+        raise ArgumentError(f"frames: expected at least {MIN_PHOTOS}, got {frames}")
+    if frames is not None and source.video is None:
+        raise ArgumentError("frames: expected a video to take them from, got photos")
+
+
 def check_photos(
-    folder: Path,
-    out: Path,
+    source: "Source",
     views: int | None = None,
     hold_out: int | None = None,
     size: int | None = None,
@@ -83,11 +103,10 @@ def check_photos(
     frames: int | None = None,
     shortest: int = 1,
 ) -> None:
-    """Check a folder of unposed photos or a video, and the options about them, before their cameras are found.
+    """Check the options about unposed photos or a video before their cameras are found.
 
     Args:
-        folder: of the photos, or a video. Of a video only the largest number of frames is known.
-        out: the folder for the results.
+        source: the photos, or a video, of which only the largest number of frames is known.
         views: to train on.
         hold_out: every Nth photo is held out.
         size: longer side of the photos in the fit; it needs the photos' headers, as `downscale` does.
@@ -95,21 +114,18 @@ def check_photos(
         frames: to be taken from a video.
         shortest: least pixels of the shorter side in the fit.
     """
-    from kgs.app.sfm.find import MAX_FRAMES, find_photos, find_video
-    from kgs.app.sfm.workspace import check_workspace
+    from kgs.app.sfm.find import MAX_FRAMES
 
-    if find_video(folder):
+    if source.video is not None:
         _check_views(views, hold_out, MAX_FRAMES if frames is None else frames, "frames")
         return
-    paths = find_photos(folder)
-    check_workspace(out, paths)
-    _check_views(views, hold_out, len(paths), "photos")
+    _check_views(views, hold_out, len(source.photos), "photos")
     if size is None and downscale is None:
         return
 
     from kgs.datasets.image_file import read_size
 
-    width, height = min(read_size(path) for path in paths)
+    width, height = min(read_size(path) for path in source.photos)
     name = "size" if downscale is None else "downscale"
     factor = max(1.0, max(width, height) / size) if size is not None else downscale or 1.0
     reduced = [max(1, round(side / factor)) for side in (width, height)]

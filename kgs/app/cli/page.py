@@ -74,8 +74,7 @@ def page(
 
     options = {**options_of_fit(ply, source), "background": background}
     if size is not None:
-        whole = load_scene(source, photos=False, hold_out=0).train
-        downscale = max(1.0, max(whole.images.shape[-2:]) / size)
+        downscale = max(1.0, max(source.photo_size()) / size)
     if downscale is not None:
         options |= {"downscale": downscale, "photo_folder": ""}
     scene = load_cameras(source, **options)

@@ -6,6 +6,7 @@ from pathlib import Path
 from kgs._support.errors import DataError
 from kgs._support.json_files import read_json
 
+UNFINISHED = "unfinished"  # the folder of a new fit and its cameras
 CHECKPOINT = "checkpoint.safetensors"
 PREVIOUS = "checkpoint.previous.safetensors"
 FILMS = ("turntable.mp4", "turntable.webm")  # a fit writes one of them
@@ -17,7 +18,7 @@ NAMES = {
         *("index.html", "splat.ply", *EXPORTS, "curve.png", "demo.png", "test/*.png"),
         *("metrics.json", "without.json", "config.json", CHECKPOINT, PREVIOUS),
     ),
-    "photos": ("photos.json", "transforms.json", "images/*", "masks/*.png", "sparse/0/*.bin"),
+    "photos": ("photos.json", "transforms.json", "images/*", "masks/*.png", "sparse/0/*"),
 }
 TEMPORARY = (".kgs-*.tmp", "*/.kgs-*.tmp", "*.partial", "work/*")  # what a kill leaves beside them
 
@@ -27,10 +28,15 @@ def has_fit(folder: Path) -> bool:
     return any((folder / name).exists() for name in (CHECKPOINT, PREVIOUS))
 
 
-def begun_on_cpu(folder: Path) -> bool:
-    """Whether the fit in this folder is one on a CPU; False where that is not known."""
+def former_fit(out: Path) -> Path | None:
+    """The folder of the fit that a resumed one goes on from: the unfinished one, or `out`; None: there is none."""
+    return next((folder for folder in (out / UNFINISHED, out) if has_fit(folder)), None)
+
+
+def begun_on_cpu(out: Path) -> bool:
+    """Whether a resumed fit goes on from one on a CPU; False where that is not known."""
     try:
-        return str(read_json(folder / "config.json")["fit"]["device"]).startswith("cpu")
+        return str(read_json((former_fit(out) or out) / "config.json")["fit"]["device"]).startswith("cpu")
     except (DataError, KeyError, TypeError):
         return False
 

@@ -16,13 +16,12 @@ from typing import TYPE_CHECKING, Self
 from kgs._support.errors import DataError, listed
 from kgs._support.json_files import read_json, write_json
 
-from .fit_files import NAMES, TEMPORARY, has_fit
+from .fit_files import NAMES, TEMPORARY, UNFINISHED, has_fit
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock
 
 MARKER = ".kgs.json"
-UNFINISHED = "unfinished"  # the folder of a new fit and its cameras
 _LOCK = ".kgs.lock"
 _NEW = ".kgs-new"  # of other new results
 _WHOLE = ".kgs-whole"
