@@ -126,14 +126,15 @@ class Results:
             return
         former = read_marker(self.out)
         new = read_marker(whole)
-        for name in (name for names in new.values() for name in names if (whole / name).is_file()):
+        moved = [name for names in new.values() for name in names]
+        for name in (name for name in moved if (whole / name).is_file()):
             (self.out / name).parent.mkdir(parents=True, exist_ok=True)
             os.replace(whole / name, self.out / name)
         for kind, names in new.items():
             _remove(self.out, {*former.get(kind, [])}.difference(names))
         write_json(self.out / MARKER, {"files": former | new})
         (whole / MARKER).unlink(missing_ok=True)
-        _remove(whole, _files_in(whole, (*TEMPORARY, *NAMES["fit"], *NAMES["photos"])))
+        _remove(whole, moved + _files_in(whole, (*TEMPORARY, *NAMES["fit"], *NAMES["photos"])))
         if _files_in(whole):  # the user's, in `work`
             os.rename(whole, self.work)
         else:
