@@ -63,7 +63,7 @@ def load_fit(
         check_plain(values, "backend", "near_plane", "notes", "step")
         settings = Settings.from_dict(values["config"])
         model = GaussianModel(**values["model"])
-        part = values["shown"]
+        part = values.get("shown", {})
         model = (model.select(**part) if part else model).to(device)
     if backend == "auto":
         backend = former_or_auto(values["backend"], model.means.device)

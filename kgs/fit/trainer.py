@@ -135,7 +135,7 @@ class Trainer:
         return Fit(
             scene=self.scene,
             model=state.model,
-            options=replace(self.renderer.options, alpha_threshold=RasterOptions.alpha_threshold),
+            options=replace(self.renderer.options, alpha_threshold=RasterOptions.alpha_threshold, absgrad=False),
             backend=self.plan.backend,
             settings=self.plan.config,
             history={

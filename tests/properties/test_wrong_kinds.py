@@ -59,6 +59,7 @@ WRONG = [
     ("model", TypeError, lambda: kgs.save_ply("x.ply", MODEL())),
     ("model", TypeError, lambda: save_glb("x.glb", MODEL(), UPRIGHT)),
     ("model", TypeError, lambda: Densifier(MODEL(), None, 1.0)),
+    ("projected", TypeError, lambda: Densifier(MODEL, torch.optim.Adam(MODEL.parameters()), 1.0).observe(MODEL())),
     ("index", TypeError, lambda: MODEL()[0]),
     ("backgrounds", TypeError, lambda: rasterize(backgrounds=[[1, 1, 1]])),
     ("background", TypeError, lambda: reference.render(MODEL(), scene().train.camera(0), [0.0, 0.0, 0.0])),
