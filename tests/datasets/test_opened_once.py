@@ -43,9 +43,9 @@ def decoded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     sizes: list[int] = []
     real = image_file._decode
 
-    def decode(plugin: type[PIL.ImageFile.ImageFile], data: bytes) -> np.ndarray:
+    def decode(image: PIL.ImageFile.ImageFile, data: bytes, header: image_file.Metadata) -> np.ndarray:
         sizes.append(len(data))
-        return real(plugin, data)
+        return real(image, data, header)
 
     monkeypatch.setattr(image_file, "_decode", decode)
     return sizes

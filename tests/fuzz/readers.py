@@ -22,6 +22,7 @@ from damage import (
 )
 from tiny_scenes import (
     narrow_lpips,
+    read_image,
     write_blender,
     write_colmap,
     write_config,
@@ -35,7 +36,6 @@ from torch import Tensor
 
 from kgs.app.saved_fit import read_request
 from kgs.datasets import Scene, Views, load_scene, synthetic_scene
-from kgs.datasets.image_file import read_image
 from kgs.fit.config import FitConfig
 from kgs.fit.plan import make_plan
 from kgs.fit.trainer import Trainer

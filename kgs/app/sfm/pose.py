@@ -67,9 +67,8 @@ def pose_photos(
             length, else they are left out. Folders in it are not looked into. Or a video, or a folder with one and
             without photos.
         out: the folder for the results, created if it does not exist.
-        masks: the folder of their masks, white where a photo is kept; None: `masks` in `folder`, if there is one, and
-            masks beside the photos, as `IMG_1_mask.png`. What is black is not matched, and `out` gets the masks in
-            `masks`.
+        masks: the folder of their masks, white where a photo is kept; None: `masks` in `folder`, if there is one.
+            What is black is not matched, and `out` gets the masks in `masks`.
         seed: of the solvers. The same photos and seed give the same files, but for the times in photos.json.
         frames: the number of frames that are taken from a video; see :func:`kgs.app.sfm.video.take_frames`.
         bar: wraps the loops to show their progress, see :mod:`kgs._support.progress`.

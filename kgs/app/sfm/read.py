@@ -177,11 +177,10 @@ class Photo:
 def open_photos(paths: list[Path], masks: Path | None = None) -> list[OpenPhoto]:
     """Open photos without decoding them. `read_photos` decodes the bytes that are read here, and opens no file again.
 
-    `masks` is a folder with masks of photos; None: those in `masks/` or `mask/` beside the photos. Others are beside
-    their photos.
+    `masks` is a folder with masks of photos; None: `masks/` beside the photos, if there is one.
 
     Raises:
-        DataError: a file cannot be read or is not a photo, or a mask is of no photo.
+        DataError: a file cannot be read or is not a photo, or masks are refused.
     """
     found = as_masks(find_mask_files(paths, paths[0].parent, masks)) if paths else {}
     return [_open(path, found.get(path)) for path in paths]
