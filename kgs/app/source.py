@@ -4,9 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-from kgs._support.errors import DataError
 from kgs.app.sfm.find import find_photos, find_video, notes_on
-from kgs.datasets.folders import CAMERAS_REPORT, layout_of, scene_nearby, why_no_scene
+from kgs.datasets.folders import CAMERAS_REPORT, layout_of, no_scene, scene_nearby
 from kgs.datasets.source import SceneSource
 
 
@@ -32,7 +31,7 @@ class Source:
             return cls.unposed(path)
         if video := find_video(path):
             return cls(path, video=video)
-        raise DataError(path, "", why_no_scene(path))
+        raise no_scene(path)
 
     @classmethod
     def unposed(cls, path: Path) -> Self:

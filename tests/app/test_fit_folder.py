@@ -172,7 +172,7 @@ def test_a_forged_checkpoint_is_refused(done: Path, changes: dict[str, Any], fie
     previous(path).unlink(missing_ok=True)
     with pytest.raises(DataError) as error:
         load_fit(done)
-    assert (error.value.path, error.value.field) == (path, field)
+    assert (error.value.path, error.value.key) == (path, field)
 
 
 def killed_before_the_move(patch: Any) -> None:
@@ -309,7 +309,7 @@ def test_an_unfinished_fit_is_gone_on_with_or_the_next_one_is_refused(scene: Any
     assert (work / "index.html").exists()
     monkeypatch.undo()
     before = contents(done)
-    with pytest.raises(DataError, match="holds a fit that is not done: use --resume, or remove") as error:
+    with pytest.raises(DataError, match="use --resume, or remove") as error:
         fit(scene, OTHER, done)
     assert error.value.path == work
     with pytest.raises(DataError, match="seed: expected 1") as error:  # also with the settings of the finished one

@@ -67,27 +67,30 @@ def folder(tmp_path):
 VIDEO = b"\0\0\0\x18ftypisom" + bytes(100)
 FOLDERS = {  # what is in them, and what is said of it
     "notes": (lambda at: save(at, [], notes_txt=b"nothing"), ("expected photos", ".jpg", "Take 3 to 12 photos")),
-    "one": (lambda at: save(at, planes()[:1]), ("at least 3 photos, found 1", "Take 3 to 12")),
-    "too deep": (lambda at: save(at / "DCIM", planes()), ("these folders in it do: DCIM",)),
+    "one": (lambda at: save(at, planes()[:1]), ("at least 3 photos, got 1", "Take 3 to 12")),
+    "too deep": (lambda at: save(at / "DCIM", planes()), ("these folders in it hold some: DCIM",)),
     "too deep, with cameras": (
         lambda at: save(save(at, [], transform_train_json=b"{}") / "images", planes()),
-        ("these folders in it do: images", "transform_train.json"),
+        ("these folders in it hold some: images", "transform_train.json"),
     ),
     "raw": (
         lambda at: save(at, planes(), raw_dng=b"II*\0"),
-        ("1 of 4 photos cannot be read (raw.dng)", "sips", "magick", "Most Compatible"),
+        ("got 1 of 4 of another kind (raw.dng)", "sips", "magick", "Most Compatible"),
     ),
-    "video called JPEG": (lambda at: save(at, planes(), z_jpg=VIDEO), ("z.jpg: is a HEIC photo or a video", "sips")),
+    "video called JPEG": (
+        lambda at: save(at, planes(), z_jpg=VIDEO),
+        ("z.jpg: expected a photo, got a HEIC", "sips"),
+    ),
     "empty": (lambda at: save(at, planes(), z_jpg=b""), ("z.jpg: expected an image, got an empty file",)),
     "videos": (
         lambda at: save(at, [], clip_MOV=VIDEO, other_mp4=VIDEO),
-        ("several videos (clip.MOV, other.mp4): name one",),
+        ("got videos (clip.MOV, other.mp4): name one",),
     ),
 }
 REFUSED = {  # photos that can be read
     "one twice": (
         lambda at: save(at, [*planes()[:2], planes()[1]]),
-        ("2.png: is the same photo as 1.png: ",),
+        ("2.png: expected another photo than 1.png, got the same: ",),
     ),
     "cropped": (
         lambda at: save(at, [*planes()[:2], planes()[0][:120]]),
@@ -159,7 +162,7 @@ def test_a_photo_is_taken_whatever_its_ending_is_called(folder, suffix):
 def test_a_photo_of_another_kind_is_named(folder, suffix):
     save(folder, planes())
     (folder / f"3.{suffix}").write_bytes(b"any")
-    with pytest.raises(DataError, match=rf"1 of 4 photos cannot be read \(3\.{suffix}\)"):
+    with pytest.raises(DataError, match=rf"got 1 of 4 of another kind \(3\.{suffix}\)"):
         find_photos(folder)
 
 
@@ -175,7 +178,7 @@ def fill_with_odd_ones(folder):
 
 def test_what_looks_like_a_photo_and_is_not_taken_is_named(folder, refused):
     fill_with_odd_ones(folder)
-    said = refused(folder.rename(folder.with_name("none")), "these folders in it do: more", "IMG_4", code=3)
+    said = refused(folder.rename(folder.with_name("none")), "these folders in it hold some: more", "IMG_4", code=3)
     fill_with_odd_ones(save(folder, planes()))
     assert [path.name for path in find_photos(folder)] == ["0.png", "1.png", "2.png"]
     said = " ".join(Source.unposed(folder).notes(None))
@@ -321,7 +324,7 @@ def test_photos_that_lie_where_results_go_are_refused(tmp_path, found):
     pose_photos(write_planes(tmp_path / "photos"), tmp_path / "out")
     images = tmp_path / "out" / "images"
     before = {path.name: path.read_bytes() for path in images.iterdir()}
-    with pytest.raises(DataError, match="holds the photos themselves"):
+    with pytest.raises(DataError, match="another folder than that of the photos"):
         pose_photos(images, tmp_path / "out")
     assert {path.name: path.read_bytes() for path in images.iterdir()} == before
 
@@ -421,7 +424,7 @@ def test_new_cameras_wait_beside_the_fit_of_the_former_ones(folder, found):
     assert pose_for_fit()["folder"] == str(out)  # those of the fit after all
     (waiting / "checkpoint.safetensors").write_bytes(b"of a fit to the four")
     save(folder, planes()[:1, 20:40], ["IMG_5.png"])
-    with pytest.raises(DataError, match="holds a fit of other photos"):
+    with pytest.raises(DataError, match="one of other photos"):
         pose_for_fit()
     with Results.open(out, "fit", ["photos"]) as results:
         results.publish("fit", "photos")

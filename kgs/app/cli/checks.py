@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kgs._support.errors import ArgumentError, DataError
+from kgs._support.errors import ArgumentError, DataError, quoted
 from kgs.datasets.folders import has_photos
 from kgs.datasets.options import held_out_between_ends
 from kgs.datasets.source import SceneSource
@@ -18,13 +18,13 @@ _HEAD = 4096  # bytes, enough for the header of any splat
 def check_roll(roll: float) -> None:
     """Raise a ValueError unless this is an angle by which pictures can be turned."""
     if not -360 <= roll <= 360:
-        raise ArgumentError(f"roll: expected degrees in [-360, 360], got {roll}")
+        raise ArgumentError("roll", "degrees in [-360, 360]", roll)
 
 
 def check_side(size: int) -> None:
     """Raise a ValueError unless photos can be fitted with so many pixels on their longer side."""
     if size < SMALLEST:
-        raise ArgumentError(f"size: expected at least {SMALLEST} pixels, got {size}")
+        raise ArgumentError("size", f"at least {SMALLEST} pixels", size)
 
 
 def check_file(out: Path, ending: str, source: Path | None = None) -> None:
@@ -35,18 +35,18 @@ def check_file(out: Path, ending: str, source: Path | None = None) -> None:
     from kgs.app.files.results import read_marker
 
     if out.suffix.lower() != ending:
-        raise ArgumentError(f"out: expected a file that ends in {ending}, got {str(out)!r}")
+        raise ArgumentError("out", f"a file that ends in {ending}", quoted(out))
     if out.is_dir():
-        raise DataError(out, "", "expected a file, found a folder of this name")
+        raise DataError(out, "", "a file", "a folder of this name")
     if source is not None and out.exists() and out.samefile(source):
-        raise ArgumentError(f"out: expected another file than {str(source)!r}, which is read")
+        raise ArgumentError("out", f"another file than {str(source)!r}, which is read")
     if not out.absolute().parent.is_dir():
-        raise DataError(out, "", "no such folder to write it to")
+        raise DataError(out, "", "a folder to write it to", "none")
     if out.exists() and not _is_of_kgs(out):
-        raise DataError(out, "", "expected a new file or one that kgs wrote, got another: choose another name")
+        raise DataError(out, "", "a new file or one that kgs wrote", "another", advice="choose another name")
     results = read_marker(out.parent)
     if any(out.name in results.get(kind, []) for kind in ("fit", "scale")):
-        raise DataError(out, "", "belongs to the results in this folder: choose another name")
+        raise DataError(out, "", "a new file", "one of the results in this folder", advice="choose another name")
 
 
 def _is_of_kgs(path: Path) -> bool:
@@ -60,8 +60,7 @@ def _is_of_kgs(path: Path) -> bool:
 def check_photos_of(source: SceneSource) -> None:
     """Raise a DataError unless a scene has at least one photo."""
     if not has_photos(source.root):
-        reason = "has camera poses but no photos: expected them in images/, or where its files say"
-        raise DataError(source.root, "", reason)
+        raise DataError(source.root, "", "photos in images/, or where its files say", "camera poses alone")
 
 
 def check_results(out: Path) -> None:
@@ -72,16 +71,16 @@ def check_results(out: Path) -> None:
     complete(out)
     config = out / "config.json"
     if not config.exists() and has_fit(out / UNFINISHED):
-        raise DataError(out, "", "holds a fit that is not done: kgs fit --resume goes on with it")
+        raise DataError(out, "", "a fit that is done", "one that is not", advice="kgs fit --resume goes on with it")
     if not config.exists():
-        raise DataError(config, "", "cannot be read: expected the folder of the results of kgs fit")
+        raise DataError(config, "", "this file in the folder of the results of kgs fit", "none")
 
 
 def check_init(init: str, source: "Source") -> None:
     """Raise an ArgumentError unless a fit can begin with these initial points."""
     if init == "scene" and (source.scene is None or source.scene.layout != "Blender"):
         kind = "photos without camera poses" if source.scene is None else f"the layout {source.scene.layout}"
-        raise ArgumentError(f"init: expected another one for {kind}, got 'scene', Blender's points")
+        raise ArgumentError("init", f"another one for {kind}", "'scene', Blender's points")
 
 
 def check_frames(frames: int | None, source: "Source") -> None:
@@ -89,9 +88,9 @@ def check_frames(frames: int | None, source: "Source") -> None:
     from kgs.app.sfm.find import MIN_PHOTOS
 
     if frames is not None and frames < MIN_PHOTOS:
-        raise ArgumentError(f"frames: expected at least {MIN_PHOTOS}, got {frames}")
+        raise ArgumentError("frames", f"at least {MIN_PHOTOS}", frames)
     if frames is not None and source.video is None:
-        raise ArgumentError("frames: expected a video to take them from, got photos")
+        raise ArgumentError("frames", "a video to take them from", "photos")
 
 
 def check_photos(
@@ -132,7 +131,7 @@ def check_photos(
     for side, minimum, pixels in (("longer", SMALLEST, max(reduced)), ("shorter", shortest, min(reduced))):
         if pixels < minimum:
             got = f"{reduced[0]}x{reduced[1]} of {width}x{height}"
-            raise ArgumentError(f"{name}: expected {minimum} pixels or more of the {side} side, got {got}")
+            raise ArgumentError(name, f"{minimum} pixels or more of the {side} side", got)
 
 
 def _check_views(views: int | None, hold_out: int | None, count: int, what: str) -> None:
@@ -140,4 +139,4 @@ def _check_views(views: int | None, hold_out: int | None, count: int, what: str)
     maximum = count - len(held_out_between_ends(count - 2, hold_out)) if hold_out else count
     if views is not None and views > maximum:
         rest = f" of which {count - maximum} are held out" if hold_out else ""
-        raise ArgumentError(f"views: expected at most {maximum} of {count} {what}{rest}, got {views}")
+        raise ArgumentError("views", f"at most {maximum} of {count} {what}{rest}", views)

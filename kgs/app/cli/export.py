@@ -46,7 +46,7 @@ def export(
 
     model = load_ply(ply, torch.tensor(origin, dtype=torch.float64))
     if not len(model):
-        raise DataError(ply, "vertex", "expected at least one Gaussian, got none")
+        raise DataError(ply, "vertex", "at least one Gaussian", "none")
     save_compressed_ply(out, model)
     sizes = [path.stat().st_size / 1e6 for path in (out, ply)]
     say(f"{printable(out)}: {len(model)} Gaussians, {sizes[0]:.2f} MB of {sizes[1]:.2f}")

@@ -87,8 +87,8 @@ def fit(
         background: the colour behind photos with transparency.
         frames: how many frames are taken from a video. Unless given: twelve, fewer where the camera moves little, more
             where it moves far.
-        masks: folder of masks, white where a photo is kept: IMG_1.png or IMG_1.jpg.png for IMG_1.jpg. Unless given:
-            masks/ beside the photos.
+        masks: folder of masks, white where a photo is kept: IMG_1.png or IMG_1.jpg.png of IMG_1.jpg. Unless given:
+            masks/.
         mask_mode: what black in a mask means. ignore: these pixels do not count. transparent: empty space.
         preset: auto: what the training views need. paper: DropGaussian's rule and recipe, as published. plain: the same
             without dropping. See --preset paper --help-all.
@@ -114,9 +114,9 @@ def fit(
         hold_out = 0
     if measure and (not source.has_kgs_cameras or hold_out or views is not None):
         reason = "photos without camera poses, and neither --hold-out nor --views: these hold photos out themselves"
-        raise ArgumentError(f"measure: expected {reason}")
+        raise ArgumentError("measure", reason)
     if views is not None and views < 1:
-        raise ArgumentError(f"views: expected a whole number of at least 1, got {views}")
+        raise ArgumentError("views", "a whole number of at least 1", views)
     check_roll(roll)
     check_size(size, downscale, source.scene is None)
     check_options(downscale, hold_out)

@@ -24,7 +24,7 @@ def open_splat(splat: Path, cameras: Path | None) -> tuple[Path, SceneSource]:
     """The PLY file of a splat, and its scene: the one that is named, or that of the fit whose folder this is."""
     if not splat.is_dir():
         if cameras is None:
-            raise ArgumentError("cameras: expected the scene of the PLY file, got none")
+            raise ArgumentError("cameras", "the scene of the PLY file", "none")
         return splat, SceneSource(cameras)
     check_results(splat)
     if cameras is None:
@@ -73,7 +73,7 @@ def load_splat(ply: Path, scene: "Scene", device: "torch.device", backend: str) 
 
     model = load_ply(ply, origin=scene.offset)
     if not len(model):
-        raise DataError(ply, "Gaussians", "expected at least one, got none")
+        raise DataError(ply, "Gaussians", "at least one", "none")
     near_plane = Recipe().near_plane * typical_depths(model.means, scene.train.cameras)[0]
     options = RasterOptions(near_plane=near_plane, antialiased=model.antialiased)
     fit = Fit(scene, model.to(device), options, backend)
@@ -97,7 +97,8 @@ def _check_seen(ply: Path, fit: "Fit") -> None:
         if not len(project(gaussians, camera, options=fit.options, colors=False, backend=fit.backend)):
             blind.append(name)
     if len(blind) == len(views):
-        reason = f"expected some that a camera of {printable(fit.scene.root)} sees, got none of {len(fit.model)}"
-        raise DataError(ply, "Gaussians", f"{reason}: are they in the frame of these cameras?")
+        expected = f"some that a camera of {fit.scene.root} sees"
+        advice = "are they in the frame of these cameras?"
+        raise DataError(ply, "Gaussians", expected, f"none of {len(fit.model)}", advice=advice)
     if blind:
         say(f"these cameras see no Gaussian of {printable(ply)}: {listed(blind)}")

@@ -39,7 +39,7 @@ def poses(
 
     source = Source.open(photos)
     if source.scene is not None:
-        raise DataError(photos, "", "has camera poses: kgs fit takes it as it is")
+        raise DataError(photos, "", "photos without camera poses", "a scene", advice="kgs fit takes it as it is")
     check_frames(frames, source)
     check_installed("pycolmap")
     with Results.open(out, "photos", resume=False) as results:

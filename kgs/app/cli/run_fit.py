@@ -5,7 +5,7 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kgs._support.errors import ArgumentError, DataError, printable, quantity
+from kgs._support.errors import ArgumentError, printable, quantity
 from kgs.app.console import VIEWER, as_line, open_in_browser, say, say_next, say_on_terminal
 from kgs.app.files.results import Results
 
@@ -105,10 +105,8 @@ def _check_side(source: "Source", request: "SceneRequest", scene: "Scene") -> No
     height, width = scene.train.images.shape[-2:]
     if max(height, width) >= SMALLEST:
         return
-    reason = f"expected at least {SMALLEST} pixels, got photos of {width}x{height}"
-    if (request.downscale or 1.0) == 1.0:
-        raise DataError(source.path, "images", reason)
-    raise ArgumentError(f"downscale: {reason}")
+    error = ArgumentError("downscale", f"at least {SMALLEST} pixels", f"photos of {width}x{height}")
+    raise error.about(source.path, "images") if (request.downscale or 1.0) == 1.0 else error
 
 
 def _say_results(fit: "Fit", folder: Path) -> None:

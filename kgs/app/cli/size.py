@@ -4,7 +4,7 @@ import re
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from kgs._support.errors import ArgumentError
+from kgs._support.errors import ArgumentError, quoted
 from kgs.app.console import say
 from kgs.fit.config import DETAILS
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 def check_size(size: int | str | None, downscale: float | None, is_unposed: bool) -> None:
     """Raise an ArgumentError unless photos can have this size."""
     if size is not None and downscale is not None:
-        raise ArgumentError("size: expected either a size or a downscale factor, got both")
+        raise ArgumentError("size", "either a size or a downscale factor", "both")
     if isinstance(size, str) and re.fullmatch(r"field|images(_\d+)?", size) is None:
-        raise ArgumentError(f"size: expected pixels, field or a folder as images_8, got {size!r}")
+        raise ArgumentError("size", "pixels, field or a folder as images_8", quoted(size))
     if isinstance(size, str) and is_unposed:
-        raise ArgumentError(f"size: expected pixels for photos without camera poses, got {size!r}")
+        raise ArgumentError("size", "pixels for photos without camera poses", quoted(size))
     if isinstance(size, int):
         check_side(size)
 

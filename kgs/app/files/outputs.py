@@ -47,5 +47,5 @@ def write_png(path: Path, image: "Tensor") -> None:
 
     ok, content = cv2.imencode(".png", eight_bits(image))
     if not ok:
-        raise DataError(path, "", f"expected an image that can be encoded, got shape {tuple(image.shape)}")
+        raise DataError(path, "", "an image that can be encoded", f"shape {tuple(image.shape)}")
     write_whole(path, content.tobytes())

@@ -56,13 +56,13 @@ class Results:
         """
         _check_folder(out, {MARKER, *marks})
         if others := sorted(set(read_marker(out)).difference([kind, *beside])):
-            raise DataError(out, "", f"expected a folder for {kind}, got one of kgs with {' and '.join(others)}")
+            raise DataError(out, "", f"a folder for {kind}", f"one of kgs with {' and '.join(others)}")
         results = cls(out, kind)
         try:
             if (out / MARKER).exists():
                 results.begin()
             if not resume and has_fit(results.work):
-                raise DataError(results.work, "", "holds a fit that is not done: use --resume, or remove this folder")
+                raise DataError(results.work, "", "no fit", "one that is not done", advice="use --resume, or remove it")
             yield results
         finally:
             results._close()
@@ -78,7 +78,7 @@ class Results:
         try:
             lock.acquire(timeout=0)
         except Timeout as error:
-            raise DataError(self.out, "", "kgs is at work in this folder: wait for it, or choose another") from error
+            raise DataError(self.out, "", "a free folder", "one in which kgs is at work") from error
         self._lock = lock
         if not (self.out / MARKER).exists():
             write_json(self.out / MARKER, {"files": {}})
@@ -170,19 +170,19 @@ def read_marker(folder: Path) -> dict[str, list[str]]:
         paths = [PurePath(name) for names in kinds.values() for name in names]
         if all(path.name and not path.anchor and ".." not in path.parts for path in paths):
             return kinds
-    raise DataError(path, "", "is no marker of kgs: remove it, or choose another folder for results")
+    raise DataError(path, "", "a marker of kgs", "another file", advice="remove it, or choose another folder")
 
 
 def _check_folder(out: Path, marks: set[str]) -> None:
     """Refuse a folder that cannot be written to, or that holds anything but results of kgs."""
     there = next(path for path in (out, *out.absolute().parents) if os.path.lexists(path))
     if not there.is_dir():
-        raise DataError(out, "", f"expected a folder for results, but {there} is none")
+        raise DataError(out, "", "a folder for results", f"{there}, which is none")
     if not os.access(there, os.W_OK | os.X_OK):
-        raise DataError(out, "", f"results cannot be written there: no permission for {there}")
+        raise DataError(out, "", "a folder that can be written to", f"no permission for {there}")
     names = sorted(path.name for path in out.iterdir() if path.name != _LOCK) if out.is_dir() else []
     if names and marks.isdisjoint(names):
-        raise DataError(out, "", f"expected a new or empty folder, or one of kgs, got one with {listed(names, 10)}")
+        raise DataError(out, "", "a new or empty folder, or one of kgs", f"one with {listed(names, 10)}")
 
 
 def _files_in(folder: Path, patterns: Iterable[str] = ("*",)) -> list[str]:
