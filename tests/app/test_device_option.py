@@ -129,6 +129,7 @@ def test_a_fit_of_a_cpu_goes_on_there_where_there_is_a_gpu_too(
     write_json(work.parent / MARKER, {"files": {}})
     monkeypatch.setattr("kgs.app.fit_folder.fit_folder", lambda *_, **__: (_ for _ in ()).throw(SystemExit(7)))
     for options, expected in ((("--resume",), taken), (("--resume", "--device", "cuda"), "cuda"), ((), "cuda")):
-        assert run("fit", folder, "-o", tmp_path / "out", *options, *QUICK) == 7
+        out = tmp_path / ("out" if "--resume" in options else "new")
+        assert run("fit", folder, "-o", out, *options, *QUICK) == 7
         named = capsys.readouterr().out.splitlines()[0]
         assert named.startswith("device: CPU, " if expected == "cpu" else "device: Card 9000 (cuda)")

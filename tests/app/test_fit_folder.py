@@ -425,7 +425,7 @@ def test_images_that_are_too_small_are_refused_before_any_work(tmp_path: Path) -
 
 
 def test_a_loaded_fit_is_the_one_that_was_saved(scene: Any, tmp_path: Path) -> None:
-    made = app.fit_folder(scene, CONFIG, tmp_path, SceneRequest("/photos", 3), say=lambda _: None).fit
+    made = fit_in(scene, CONFIG, tmp_path, SceneRequest("/photos", 3), say=lambda _: None).fit
     request, saved = load_fit(tmp_path)
     assert request == SceneRequest("/photos", 3)
     for name in ("options", "backend", "settings", "decisions", "notes"):

@@ -14,7 +14,7 @@ from kgs._support.errors import DataError
 from kgs._support.json_files import write_json
 from kgs.app import sfm
 from kgs.app.files.outputs import write_png
-from kgs.app.source import Source
+from kgs.app.sfm.source import Source
 from kgs.datasets import synthetic_scene
 from kgs.datasets.folders import scene_nearby
 from kgs.fit.config import COARSE, DETAILS

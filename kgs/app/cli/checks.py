@@ -8,8 +8,10 @@ from kgs.datasets.folders import has_photos
 from kgs.datasets.options import held_out_between_ends
 from kgs.datasets.source import SceneSource
 
+from .tools import check_installed
+
 if TYPE_CHECKING:
-    from kgs.app.source import Source
+    from kgs.app.sfm.source import Source
 
 SMALLEST = 32  # pixels of the longer side of a fit's photos
 _HEAD = 4096  # bytes, enough for the header of any splat
@@ -97,15 +99,15 @@ def check_photos(
     source: "Source",
     views: int | None = None,
     hold_out: int | None = None,
-    size: int | None = None,
+    size: int | str | None = None,
     downscale: float | None = None,
     frames: int | None = None,
     shortest: int = 1,
 ) -> None:
-    """Check the options about unposed photos or a video before their cameras are found.
+    """Check that a scene has photos; of unposed photos check the options before their cameras are found.
 
     Args:
-        source: the photos, or a video, of which only the largest number of frames is known.
+        source: a scene, photos, or a video, of which only the largest number of frames is known.
         views: to train on.
         hold_out: every Nth photo is held out.
         size: longer side of the photos in the fit; it needs the photos' headers, as `downscale` does.
@@ -115,6 +117,10 @@ def check_photos(
     """
     from kgs.app.sfm.find import MAX_FRAMES
 
+    if source.scene is not None:
+        check_photos_of(source.scene)
+        return
+    check_installed("pycolmap")
     if source.video is not None:
         _check_views(views, hold_out, MAX_FRAMES if frames is None else frames, "frames")
         return
@@ -126,7 +132,7 @@ def check_photos(
 
     width, height = min(ImageFile(path).size for path in source.photos)
     name = "size" if downscale is None else "downscale"
-    factor = max(1.0, max(width, height) / size) if size is not None else downscale or 1.0
+    factor = max(1.0, max(width, height) / size) if isinstance(size, int) else downscale or 1.0
     reduced = [max(1, round(side / factor)) for side in (width, height)]
     for side, minimum, pixels in (("longer", SMALLEST, max(reduced)), ("shorter", shortest, min(reduced))):
         if pixels < minimum:

@@ -13,11 +13,11 @@ from kgs._support.errors import ArgumentError
 from kgs.app.files.results import Results
 from kgs.fit.config import COARSE, DETAILS, PRESETS, Background, FitConfig, min_side
 
-from .checks import check_frames, check_init, check_photos, check_photos_of, check_roll
+from .checks import check_frames, check_init, check_photos, check_roll
 from .options import QUIET, Flag, IfGiven, Open, Out
 from .run_fit import run_fit
 from .size import check_size, default_size
-from .tools import check_installed, load_tools
+from .tools import load_tools
 from .words import options_in
 
 # The short help shows these entries of FitConfig, and all other options of the command but the rare ones.
@@ -105,7 +105,7 @@ def fit(
     """
     from kgs.app.files.fit_files import begun_on_cpu
     from kgs.app.scene_request import SceneRequest
-    from kgs.app.source import Source
+    from kgs.app.sfm.source import Source
     from kgs.datasets.options import check_options
     from kgs.metrics.weights import weight_files
 
@@ -124,13 +124,8 @@ def fit(
     if lpips_weights is not None:
         weight_files(lpips_weights)
     with Results.open(out, "fit", ["photos"] if source.scene is None else [], resume) as results:
-        if source.scene is None:
-            check_installed("pycolmap")
-            pixels = size if isinstance(size, int) else None
-            shortest = min_side(config, lpips_weights is not None)
-            check_photos(source, views, hold_out, pixels, downscale, frames, shortest)
-        else:
-            check_photos_of(source.scene)
+        shortest = min_side(config, lpips_weights is not None)
+        check_photos(source, views, hold_out, size, downscale, frames, shortest)
         check_init(config.init, source)
         if resume and config.device == "auto" and begun_on_cpu(out):
             config = replace(config, device="cpu")  # on a GPU it would go on with other bits

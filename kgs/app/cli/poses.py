@@ -35,7 +35,7 @@ def poses(
             masks/ beside the photos.
         seed: of the solvers.
     """
-    from kgs.app.source import Source
+    from kgs.app.sfm.source import Source
 
     source = Source.open(photos)
     if source.scene is not None:

@@ -15,7 +15,7 @@ from .unposed import find_scene, on_ctrl_c
 
 if TYPE_CHECKING:
     from kgs.app.scene_request import SceneRequest
-    from kgs.app.source import Source
+    from kgs.app.sfm.source import Source
     from kgs.datasets.scene import Scene
     from kgs.fit.config import FitConfig
     from kgs.fit.fit import Fit

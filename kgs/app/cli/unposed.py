@@ -12,7 +12,7 @@ from kgs.datasets.source import SceneSource
 if TYPE_CHECKING:
     from kgs.app.files.results import Results
     from kgs.app.scene_request import SceneRequest
-    from kgs.app.source import Source
+    from kgs.app.sfm.source import Source
 
 
 def find_scene(

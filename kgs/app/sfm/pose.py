@@ -22,7 +22,6 @@ from kgs.app.console import each, say
 from kgs.app.files.fit_files import has_fit
 from kgs.app.files.outputs import png_names
 from kgs.app.files.results import Results
-from kgs.app.source import Source
 from kgs.datasets.folders import CAMERAS_REPORT as REPORT
 from kgs.datasets.image_file import color_notes
 
@@ -40,6 +39,7 @@ from .map import Cameras, quiet_pycolmap
 from .match import exif_focal
 from .pycolmap_processes import check_space
 from .read import FILM_DIAGONAL, OpenPhoto, Photo, blurred, open_photos, read_photos, unlike_others
+from .source import Source
 from .video import take_frames
 from .write import level_and_scale, upright, write_images, write_masks, write_model
 

@@ -4,9 +4,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-from kgs.app.sfm.find import find_photos, find_video, notes_on
 from kgs.datasets.folders import CAMERAS_REPORT, layout_of, no_scene, scene_nearby
 from kgs.datasets.source import SceneSource
+
+from .find import find_photos, find_video, notes_on
 
 
 @dataclass(frozen=True)
