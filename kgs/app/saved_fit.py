@@ -11,7 +11,7 @@ from kgs._support.errors import DataError
 from kgs._support.json_files import read_json
 from kgs.app.files.publishing import complete
 from kgs.app.files.results_folder import CHECKPOINT
-from kgs.backends import former_or_auto
+from kgs.backends import get_backend
 from kgs.datasets.scene import Scene
 from kgs.fit.checkpoint import newest_checkpoint
 from kgs.fit.config import FitConfig
@@ -64,7 +64,7 @@ def load_fit(
     values, damage = newest_checkpoint(path)
     model = _read_model(path, values).to(device)
     if backend == "auto":
-        backend = former_or_auto(values["backend"], model.means.device)
+        backend = get_backend(values["backend"], model.means.device, required=False).name
     if values["step"] != metrics.get("steps"):
         whose = "that of the previous checkpoint, " if damage else ""
         reason = f"expected that of metrics.json, {metrics.get('steps')}, got {whose}{values['step']}: resume the fit"

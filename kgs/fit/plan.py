@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, Self
 import torch
 
 from kgs._support.machine import check_device
-from kgs.backends import resolve
+from kgs.backends import get_backend
 from kgs.datasets.scene import Scene
 from kgs.init_points.dense import FEW_VIEWS
 from kgs.types import check_kind
@@ -82,7 +82,7 @@ def make_plan(scene: Scene, config: FitConfig) -> Plan:
     check_kind("scene", scene, Scene)
     check_kind("config", config, FitConfig)
     device = check_device(config.device)
-    backend = resolve(config.backend, device)
+    backend = get_backend(config.backend, device).name
     config = with_step_defaults(config, len(scene.train))
     return Plan(config, device, backend, make_schedule(config))
 

@@ -17,7 +17,7 @@ from kgs.backends.torch.binning import bin_to_tiles
 @pytest.fixture(autouse=True)
 def _torch_alone(monkeypatch):
     """The kernels have one size of tiles, and no chunks; some tests look inside the torch implementation."""
-    monkeypatch.setattr(backends, "BACKENDS", (backends.TorchBackend(),))
+    monkeypatch.setattr(backends, "BACKENDS", {"torch": backends.BACKENDS["torch"]})
 
 
 def loss_and_gradients(projected, features, weights, **options):

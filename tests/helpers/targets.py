@@ -52,7 +52,7 @@ COMPILED = pytest.mark.parametrize("kernels", [_NUMBA, _CARD], indirect=True)
 
 def skip_unless_there(target: Target) -> None:
     """Skip the test where the backend is not installed, or is for a card alone."""
-    if not next(backend for backend in BACKENDS if backend.name == target.backend).is_installed():
+    if not BACKENDS[target.backend].is_installed():
         pytest.skip(f"{target.backend} is not installed")
     if target.interpreted and os.environ.get("TRITON_INTERPRET") != "1":
         pytest.skip("Triton's interpreter is off")

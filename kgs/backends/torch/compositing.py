@@ -19,10 +19,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from kgs.backends.base import CompositingCall, CompositingInputs, Compositor, Images
 from kgs.backends.row_slices import MAX_BYTES
+from kgs.backends.signatures import Compositor, Images, Inputs
 from kgs.covariance import footprint_table, moment_gradients
-from kgs.types import RasterOptions
+from kgs.types import ProjectedGaussians, RasterOptions
 
 from .binning import TileCoverage, TileLists
 
@@ -47,10 +47,14 @@ _ARRAYS = 9  # numbers per pair that a step holds at the same time
 class TorchCompositor(Compositor):
     """Compositing on every device and in every dtype."""
 
-    def __init__(self, call: CompositingCall) -> None:
-        projected = call.projected
-        features = call.features
-        options = call.options
+    def __init__(
+        self,
+        projected: ProjectedGaussians,
+        features: Tensor,
+        options: RasterOptions,
+        median_depth: bool = False,
+        chunk_size: int | None = None,
+    ) -> None:
         self._settings = SETTINGS.get(features.device.type, SETTINGS["cuda"])
         tile_size = options.tile_size or 8
         number = features.element_size()
@@ -70,13 +74,14 @@ class TorchCompositor(Compositor):
         self._spare = budget - lists_bytes if len(self._row_slices) == 1 else 0  # to keep alphas
         self._image_size = projected.image_size
         self._eps2d = projected.eps2d
-        self._depths = projected.depths.detach() if call.median_depth else None
-        self._cut = Cut(step_bytes // (arrays * number), call.chunk_size)
+        self._depths = projected.depths.detach() if median_depth else None
+        self._cut = Cut(step_bytes // (arrays * number), chunk_size)
         self._thresholds = Thresholds.of(options, features.dtype)
         self._absgrad = options.absgrad
+        self._kept: Any = None  # transmittance, and depth slices with their ranks
 
-    def forward(self, inputs: CompositingInputs, keep: bool) -> tuple[Images, Any]:
-        """See `Compositor`. One row slice is kept, several are computed again."""
+    def forward(self, inputs: Inputs, keep: bool) -> Images:
+        """The images, a row slice after the other; of several none is kept."""
         keep = keep and len(self._row_slices) == 1
         results = [self._composite_rows(inputs, rows, keep) for rows in self._row_slices]
         canvases = [canvas for canvas, _ in results]
@@ -84,17 +89,14 @@ class TorchCompositor(Compositor):
         grid = self._coverage.grid
         size = self._image_size
         images = (to_images(features, grid, size), to_images(transmittance, grid, size), to_images(median, grid, size))
-        return images, results[0][1] if keep else None
+        self._kept = results[0][1] if keep else None
+        return images
 
     def backward(
-        self,
-        inputs: CompositingInputs,
-        kept: Any,
-        grad_features: Tensor,
-        grad_transmittance: Tensor,
-        needs: tuple[bool, ...],
+        self, inputs: Inputs, grad_features: Tensor, grad_transmittance: Tensor, needs: tuple[bool, ...]
     ) -> tuple[tuple[Tensor | None, ...], Tensor | None]:
-        """See `Compositor`."""
+        """The gradients, a row slice after the other; those that were not kept are composited again."""
+        kept, self._kept = self._kept, None
         coverage = self._coverage
         grads = to_tiles(grad_features, coverage.grid, coverage.tile_size)
         behind = to_tiles(grad_transmittance, coverage.grid, coverage.tile_size)
@@ -111,13 +113,12 @@ class TorchCompositor(Compositor):
         moments, absolute, features = total.split(wanted.widths(grads.shape[0]), 1)
         gradients: tuple[Tensor | None, ...] = (None, None, None, features)
         if wanted.moments:
-            factors = inputs.factors.index_select(0, coverage.ids)
-            opacities = inputs.opacities.index_select(0, coverage.ids)
+            factors, opacities = (x.index_select(0, coverage.ids) for x in inputs[1:3])
             gradients = (*moment_gradients(moments, factors, opacities, self._eps2d), features)
 
         def spread(value: Tensor) -> Tensor:
             """From the Gaussians that reach a tile to all, 0 for the others."""
-            return value.new_zeros(inputs.means2d.shape[0], *value.shape[1:]).index_copy_(0, coverage.ids, value)
+            return value.new_zeros(inputs[0].shape[0], *value.shape[1:]).index_copy_(0, coverage.ids, value)
 
         needed = zip(gradients, needs, strict=True)
         return (
@@ -125,16 +126,15 @@ class TorchCompositor(Compositor):
             spread(absolute) if wanted.absolute else None,
         )
 
-    def _composite_rows(self, inputs: CompositingInputs, rows: tuple[int, int], keep: bool) -> tuple["Canvas", Any]:
+    def _composite_rows(self, inputs: Inputs, rows: tuple[int, int], keep: bool) -> tuple["Canvas", Any]:
         """A row slice, one depth slice after the other until all pixels are opaque, and what `backward` needs."""
         coverage = self._coverage
         tiles = (rows[1] - rows[0]) * coverage.grid[1]
         pixels = coverage.tile_size**2
-        like = inputs.means2d
+        like, features = inputs[0], inputs[3]
         transmittance = like.new_ones(1, pixels, tiles)
         median = like.new_zeros(0 if self._depths is None else 1, pixels, tiles)
-        features = like.new_zeros(inputs.features.shape[1], pixels, tiles)
-        canvas = (transmittance, median, features)
+        canvas = (transmittance, median, like.new_zeros(features.shape[1], pixels, tiles))
         spans = coverage.spans(*rows)
         spare = self._spare
         live = None
@@ -153,7 +153,7 @@ class TorchCompositor(Compositor):
                     break
         return canvas, (transmittance, slices) if keep else None
 
-    def _gaussians(self, inputs: CompositingInputs, ids: Tensor) -> "Columns":
+    def _gaussians(self, inputs: Inputs, ids: Tensor) -> "Columns":
         """What steps need of some Gaussians, followed by a dummy that is never seen."""
         means2d, factors, opacities, features = (x.index_select(0, ids) for x in inputs)
         table = F.pad(footprint_table(means2d, factors, opacities, self._eps2d), (0, 1))
