@@ -29,18 +29,31 @@ from .torch import activation, blending, projection
 from .torch.compositing import TorchCompositor
 
 
-def lazy(path: str) -> Any:
-    """A function that imports "module:function" when it is first called, and calls it."""
-    module, _, name = path.partition(":")
+class Lazy:
+    """A function, "module:name", whose module is imported when it is first called."""
 
-    @functools.cache
-    def load() -> Any:
+    def __init__(self, path: str) -> None:
+        self._path = path
+
+    @functools.cached_property
+    def _function(self) -> Any:
+        module, _, name = self._path.partition(":")
         return getattr(import_module(module), name)
 
-    return lambda *args, **kwargs: load()(*args, **kwargs)
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """What the function returns."""
+        return self._function(*args, **kwargs)
 
 
-@dataclass(frozen=True, eq=False)
+def _always(device: torch.device) -> bool:
+    return True
+
+
+def _nothing_to_compile(run: Callable[[torch.device], object], device: torch.device) -> None:
+    return
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Backend:
     """An implementation of the renderer and of the other heavy stages of a fit, see `kgs.backends.signatures`.
 
@@ -68,8 +81,8 @@ class Backend:
     devices: tuple[str, ...] | None = None
     dtypes: tuple[torch.dtype, ...] = (torch.float32, torch.float64)
     package: tuple[str, str] | None = None
-    is_trusted: Callable[[torch.device], bool] = lambda device: True
-    compile_ahead: Callable[[Callable[[torch.device], object], torch.device], None] = lambda run, device: None
+    is_trusted: Callable[[torch.device], bool] = _always
+    compile_ahead: Callable[[Callable[[torch.device], object], torch.device], None] = _nothing_to_compile
     tile_size: int = 8
     max_width: float = float("inf")
     max_absgrad_features: float = float("inf")

@@ -24,7 +24,7 @@ Rules that keep the kernels fast. Breaking any of them cost a measured factor of
 import torch
 
 from kgs._support.extras import installing
-from kgs.backends.table import Backend, lazy
+from kgs.backends.table import Backend, Lazy
 
 # for pinhole cameras: others go to torch, inside the call
 NUMBA = Backend(
@@ -35,9 +35,9 @@ NUMBA = Backend(
     tile_size=8,  # a constant of the kernels
     max_width=2**18 - 8,  # columns of tiles, and how many, are numbers of 15 bits
     max_absgrad_features=8,  # a block: sums of absolute values of several would be added up
-    project=lazy("kgs.backends.cpu.projection:project"),
-    compositor=lazy("kgs.backends.cpu.compositing:CpuCompositor"),
-    loss=lazy("kgs.backends.cpu.loss:loss"),
-    loss_gradient=lazy("kgs.backends.cpu.loss:loss_gradient"),
-    local_moments=lazy("kgs.backends.cpu.loss:local_moments"),
+    project=Lazy("kgs.backends.cpu.projection:project"),
+    compositor=Lazy("kgs.backends.cpu.compositing:CpuCompositor"),
+    loss=Lazy("kgs.backends.cpu.loss:loss"),
+    loss_gradient=Lazy("kgs.backends.cpu.loss:loss_gradient"),
+    local_moments=Lazy("kgs.backends.cpu.loss:local_moments"),
 )

@@ -25,7 +25,7 @@ import os
 
 import torch
 
-from kgs.backends.table import Backend, lazy
+from kgs.backends.table import Backend, Lazy
 
 
 class _Triton(Backend):
@@ -40,17 +40,17 @@ TRITON = _Triton(
     devices=("cuda", "xpu"),  # "cuda" are AMD's, too
     dtypes=(torch.float32,),
     package=("triton", "torch brings it on Linux; on Windows: pip install triton-windows"),
-    is_trusted=lazy("kgs.backends.gpu.trust:is_trusted"),
-    compile_ahead=lazy("kgs.backends.gpu.compiling:compile_ahead"),
+    is_trusted=Lazy("kgs.backends.gpu.trust:is_trusted"),
+    compile_ahead=Lazy("kgs.backends.gpu.compiling:compile_ahead"),
     tile_size=8,  # a constant of the kernels
     max_absgrad_features=4,  # a block: sums of absolute values of several would be added up
-    activate=lazy("kgs.backends.gpu.activation:activate"),
-    project=lazy("kgs.backends.gpu.projection:project"),
-    compositor=lazy("kgs.backends.gpu.compositing:GpuCompositor"),
-    blend=lazy("kgs.backends.gpu.blending:blend"),
-    loss=lazy("kgs.backends.gpu.loss:loss"),
-    loss_gradient=lazy("kgs.backends.gpu.loss:loss_gradient"),
-    adam_step=lazy("kgs.backends.gpu.optimizer:adam_step"),
-    add_gradient_norms=lazy("kgs.backends.gpu.optimizer:add_gradient_norms"),
-    decay_opacity=lazy("kgs.backends.gpu.optimizer:decay_opacity"),
+    activate=Lazy("kgs.backends.gpu.activation:activate"),
+    project=Lazy("kgs.backends.gpu.projection:project"),
+    compositor=Lazy("kgs.backends.gpu.compositing:GpuCompositor"),
+    blend=Lazy("kgs.backends.gpu.blending:blend"),
+    loss=Lazy("kgs.backends.gpu.loss:loss"),
+    loss_gradient=Lazy("kgs.backends.gpu.loss:loss_gradient"),
+    adam_step=Lazy("kgs.backends.gpu.optimizer:adam_step"),
+    add_gradient_norms=Lazy("kgs.backends.gpu.optimizer:add_gradient_norms"),
+    decay_opacity=Lazy("kgs.backends.gpu.optimizer:decay_opacity"),
 )
