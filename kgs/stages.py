@@ -132,7 +132,7 @@ def composite(
         options: None for the defaults. Only tile_size, alpha_threshold, transmittance_stop, max_bytes and absgrad
             matter here.
         median_depth: also return the depth at which the transmittance falls below one half.
-        chunk_size: entries of a tile per step of the torch backend; None chooses by the length of the lists.
+        chunk_size: entries of a tile in a chunk of the torch backend; None chooses by the length of the lists.
         backend: "auto", or the name of one, see `kgs.backends`.
 
     Returns:

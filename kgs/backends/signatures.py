@@ -51,7 +51,7 @@ class Compositor(ABC):
         features: `(M, F)`.
         options: `tile_size` is a number.
         median_depth: whether the median depth is wanted.
-        chunk_size: entries of a tile that the torch backend takes at a time; None chooses.
+        chunk_size: entries of a tile in a chunk of the torch backend; None chooses.
 
     Raises:
         ValueError: the list of one row of tiles does not fit into `max_bytes`.

@@ -2,11 +2,11 @@
 
 Tiles are the last dimension of all tensors here, and P the pixels of a tile: an operator works on the same pixel of
 many tiles side by side. A row slice is made of depth slices; within one, tiles are sorted by the length of their lists
-and cut into steps: K layers of n tiles, `(K, P, n)`, as many as fit into memory.
+and cut into chunks: K layers of n tiles, `(K, P, n)`, as many as fit into memory.
 
 There are no matrix products: torch may round them (`torch.set_float32_matmul_precision`, `torch.autocast`), and the
 order of their sums depends on sizes. Nothing is added atomically. On a CPU the layers of a pixel are added one by one,
-so that no bit of the image depends on how they were cut into steps.
+so that no bit of the image depends on how they were cut into chunks.
 """
 
 import math
@@ -33,15 +33,15 @@ ALPHA_MAX = 0.99
 class DeviceSettings:
     """How work is cut for a kind of device."""
 
-    pairs: int  # of a Gaussian and a pixel in a step, at most
+    pairs: int  # of a Gaussian and a pixel in a chunk, at most
     layers: int  # entries per tile in a depth slice: few pixels need more before they are opaque
     by_layer: bool  # scans are made layer by layer: least memory is passed, and many operators are called
     may_ask: bool  # whether reading a number is cheap; on a GPU it waits until all work is done
 
 
 SETTINGS = {"cpu": DeviceSettings(2**19, 192, True, True), "cuda": DeviceSettings(2**24, 192, False, False)}
-_MIN_LAYERS = 8  # of a step with many tiles
-_ARRAYS = 9  # numbers per pair that a step holds at the same time
+_MIN_LAYERS = 8  # of a chunk with many tiles
+_ARRAYS = 9  # numbers per pair that a chunk holds at the same time
 
 
 class TorchCompositor(Compositor):
@@ -60,8 +60,8 @@ class TorchCompositor(Compositor):
         number = features.element_size()
         arrays = _ARRAYS + 3 * options.absgrad
         max_bytes = options.max_bytes or MAX_BYTES
-        step_bytes = min(self._settings.pairs * arrays * number, max_bytes // 4)
-        budget = max_bytes - step_bytes
+        chunk_bytes = min(self._settings.pairs * arrays * number, max_bytes // 4)
+        budget = max_bytes - chunk_bytes
         # working memory of a Gaussian in a row of tiles; and in a tile: lists, sorting, gradients, sum, saved T
         width = 8 + 2 * features.shape[1] + 4 * options.absgrad + tile_size**2 // 8
         per_span = 32 + 16 * number
@@ -75,7 +75,7 @@ class TorchCompositor(Compositor):
         self._image_size = projected.image_size
         self._eps2d = projected.eps2d
         self._depths = projected.depths.detach() if median_depth else None
-        self._cut = Cut(step_bytes // (arrays * number), chunk_size)
+        self._cut = Cut(chunk_bytes // (arrays * number), chunk_size)
         self._thresholds = Thresholds.of(options, features.dtype)
         self._absgrad = options.absgrad
         self._kept: Any = None  # transmittance, and depth slices with their ranks
@@ -154,7 +154,7 @@ class TorchCompositor(Compositor):
         return canvas, (transmittance, slices) if keep else None
 
     def _gaussians(self, inputs: Inputs, ids: Tensor) -> "Columns":
-        """What steps need of some Gaussians, followed by a dummy that is never seen."""
+        """What chunks need of some Gaussians, followed by a dummy that is never seen."""
         means2d, factors, opacities, features = (x.index_select(0, ids) for x in inputs)
         table = F.pad(footprint_table(means2d, factors, opacities, self._eps2d), (0, 1))
         table[0, -1] = -torch.inf
@@ -210,7 +210,7 @@ class Thresholds:
 
 
 @dataclass
-class Step:
+class Chunk:
     """K layers of n tiles, and what the backward pass needs of them."""
 
     tiles: slice  # of the sorted tiles
@@ -223,28 +223,28 @@ class Step:
 
 @dataclass(frozen=True)
 class Cut:
-    """How lists are cut into steps."""
+    """How lists are cut into chunks."""
 
     pairs: int  # of a Gaussian and a pixel, at most
     layers: int | None  # K; None chooses
 
-    def __call__(self, lengths: Sequence[int], pixels: int) -> list[Step]:
-        """The steps of tiles with lists of these lengths, in descending order."""
+    def __call__(self, lengths: Sequence[int], pixels: int) -> list[Chunk]:
+        """The chunks of tiles with lists of these lengths, in descending order."""
         max_tiles = max(1, self.pairs // (pixels * (self.layers or _MIN_LAYERS)))
-        steps = []
+        chunks = []
         for begin in range(0, len(lengths), max_tiles):
             end = min(begin + max_tiles, len(lengths))
             first = 0
             while first < lengths[begin]:
                 while lengths[end - 1] <= first:
                     end -= 1
-                # as many layers as a quarter of the lists still has: the longest take another step, with few tiles
+                # as many layers as a quarter of the lists still has: the longest take another chunk, with few tiles
                 fitting = max(self.pairs // (pixels * (end - begin)), 1)
                 wanted = max(lengths[begin + (end - begin) // 4] - first, fitting // 4)
                 layers = self.layers or min(wanted, fitting, lengths[begin] - first)
-                steps.append(Step(slice(begin, end), first, layers))
+                chunks.append(Chunk(slice(begin, end), first, layers))
                 first += layers
-        return steps
+        return chunks
 
 
 class DepthSlice:
@@ -265,8 +265,8 @@ class DepthSlice:
         self._starts = lists.offsets[:-1].index_select(0, self._tiles)
         self._ends = lists.offsets[1:].index_select(0, self._tiles)
         pixels = lists.tile_size**2
-        self._steps = cut(counts, pixels)
-        pairs = pixels * sum(step.layers * (step.tiles.stop - step.tiles.start) for step in self._steps)
+        self._chunks = cut(counts, pixels)
+        pairs = pixels * sum(chunk.layers * (chunk.tiles.stop - chunk.tiles.start) for chunk in self._chunks)
         self.alpha_bytes = pairs * gaussians.table.element_size()  # to keep all alphas
         self._entries = F.pad(lists.entries, (0, 1), value=lists.ids.shape[0])
         # coordinates of the columns and rows of pixels of each tile, (side, tiles)
@@ -278,20 +278,20 @@ class DepthSlice:
         self._clamps = self._may(gaussians.table[0] > math.log(ALPHA_MAX))
 
     def composite(self, canvas: Canvas, keep: bool, keep_alphas: bool) -> None:
-        """Add the layers to the tiles of a canvas, front to back; with `keep` each step keeps what `backward` needs."""
+        """Add the layers to the tiles of a canvas, front to back; with `keep` chunks keep what `backward` needs."""
         state = [x.index_select(2, self._tiles) for x in canvas]
-        for step in self._steps:
-            transmittance, median, features = (x[:, :, step.tiles] for x in state)
-            _, ids = self._entries_of(step)
-            alpha = self._alphas(*self._offsets(step, ids))
+        for chunk in self._chunks:
+            transmittance, median, features = (x[:, :, chunk.tiles] for x in state)
+            _, ids = self._entries_of(chunk)
+            alpha = self._alphas(*self._offsets(chunk, ids))
             layers = self._transmittances(alpha, transmittance[0])
             ended = self._may(layers[-1] <= self._thresholds.transmittance)
             if ended:  # T never grows, so cutting afterwards is cutting at each layer
                 F.threshold(layers, self._thresholds.transmittance, 0.0, inplace=True)
             if keep:
-                step.before = transmittance[0].clone()
-                step.alpha = alpha if keep_alphas else None
-                step.ended = ended
+                chunk.before = transmittance[0].clone()
+                chunk.alpha = alpha if keep_alphas else None
+                chunk.ended = ended
             if self._gaussians.depths is not None:
                 crossing = (layers[:-1] >= 0.5) & (layers[1:] < 0.5)
                 depths = self._gaussians.depths.index_select(0, ids.view(-1)).view_as(ids)
@@ -312,23 +312,23 @@ class DepthSlice:
         own_grads = grads.index_select(2, self._tiles)
         own_behind = behind.index_select(1, self._tiles)
         rows = grads.new_zeros(self._entries.shape[0], width)  # of each entry, and one for what is beyond the lists
-        while self._steps:
-            step = self._steps.pop()  # whose memory is free afterwards
-            positions, ids = self._entries_of(step)
-            pixels = own_grads[:, :, step.tiles]
-            sums = self._step_sums(step, ids, pixels, own_behind[:, step.tiles], wanted)
+        while self._chunks:
+            chunk = self._chunks.pop()  # whose memory is free afterwards
+            positions, ids = self._entries_of(chunk)
+            pixels = own_grads[:, :, chunk.tiles]
+            sums = self._chunk_sums(chunk, ids, pixels, own_behind[:, chunk.tiles], wanted)
             rows.index_copy_(0, positions.view(-1), torch.stack(sums, -1).view(-1, width))
         behind.index_copy_(1, self._tiles, own_behind)
         # each entry once, in the order of the Gaussians: a sum in fixed order, without atomics
         return F.embedding_bag(lists.by_gaussian, rows, lists.gaussian_offsets, mode="sum")
 
-    def _step_sums(self, step: Step, ids: Tensor, grads: Tensor, behind: Tensor, wanted: Wanted) -> list[Tensor]:
-        """What is wanted of the entries of a step, each `(K, n)`; `behind` moves before the step."""
-        table, dx, dy = self._offsets(step, ids)
-        alpha = self._alphas(table, dx, dy) if step.alpha is None else step.alpha
-        assert step.before is not None
-        transmittance = self._transmittances(alpha, step.before)
-        if step.ended:  # nothing counts behind the stop
+    def _chunk_sums(self, chunk: Chunk, ids: Tensor, grads: Tensor, behind: Tensor, wanted: Wanted) -> list[Tensor]:
+        """What is wanted of the entries of a chunk, each `(K, n)`; `behind` moves before the chunk."""
+        table, dx, dy = self._offsets(chunk, ids)
+        alpha = self._alphas(table, dx, dy) if chunk.alpha is None else chunk.alpha
+        assert chunk.before is not None
+        transmittance = self._transmittances(alpha, chunk.before)
+        if chunk.ended:  # nothing counts behind the stop
             F.threshold(transmittance, self._thresholds.transmittance, 0.0, inplace=True)
             alpha.mul_(transmittance[:-1].sign())
         weights = alpha * transmittance[:-1]
@@ -349,22 +349,22 @@ class DepthSlice:
             sums += [torch.mul(weights, grad, out=product).sum(1) for grad in grads]
         return sums
 
-    def _entries_of(self, step: Step) -> tuple[Tensor, Tensor]:
-        """Where the entries of a step are in the lists, and their Gaussians, `(K, n)`; beyond a list the dummy."""
-        layers = torch.arange(step.first, step.first + step.layers, device=self._starts.device)
-        positions = self._starts[step.tiles] + layers[:, None]
-        positions = positions.where(positions < self._ends[step.tiles], self._entries.shape[0] - 1)
+    def _entries_of(self, chunk: Chunk) -> tuple[Tensor, Tensor]:
+        """Where the entries of a chunk are in the lists, and their Gaussians, `(K, n)`; beyond a list the dummy."""
+        layers = torch.arange(chunk.first, chunk.first + chunk.layers, device=self._starts.device)
+        positions = self._starts[chunk.tiles] + layers[:, None]
+        positions = positions.where(positions < self._ends[chunk.tiles], self._entries.shape[0] - 1)
         return positions, self._entries.index_select(0, positions.view(-1)).view_as(positions)
 
     def _features(self, ids: Tensor) -> Tensor:
         """`(F, K, n)`."""
         return self._gaussians.features.index_select(1, ids.view(-1)).view(-1, *ids.shape)
 
-    def _offsets(self, step: Step, ids: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _offsets(self, chunk: Chunk, ids: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Columns of the Gaussians `(7, K, n)`, and from these to columns and rows of pixels, `(K, side, n)`."""
         table = self._gaussians.table.index_select(1, ids.view(-1)).view(-1, *ids.shape)
-        dx = self._columns[:, step.tiles] - table[1][:, None]
-        dy = self._rows[:, step.tiles] - table[2][:, None]
+        dx = self._columns[:, chunk.tiles] - table[1][:, None]
+        dy = self._rows[:, chunk.tiles] - table[2][:, None]
         return table, dx, dy
 
     def _alphas(self, table: Tensor, dx: Tensor, dy: Tensor) -> Tensor:
