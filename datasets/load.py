@@ -81,8 +81,8 @@ def load_scene(
             (they are on torch's "meta" device), `masks` and `train_full_size` are None.
         photo_folder: where a scene (LLFF, COLMAP) has its photos in several sizes, the name of the folder to take, as
             "images_8"; "": that of the largest, `images` first. See also :func:`kgs.datasets.field.field_size`.
-        masks: a folder with masks of the photos, which have their stems; white is kept. None: those that the layout's
-            files name, or those in `masks/`, and those beside the photos (`IMG_1_mask.png`, `dynamic_mask_IMG_1.png`).
+        masks: a folder with masks of the photos, which have their stems or names; white is kept. None: the masks that
+            the layout's files name, else those in `masks/`.
         mask_mode: what black in a mask means. "ignore": such pixels are ignored (somebody walked by), see
             `Views.valid_mask`. "transparent": nothing is there, as where an image is transparent.
 
@@ -147,7 +147,7 @@ def load_scene(
 
 
 def _with_masks(root: Path, frame_set: FrameSet, folder: Path | None) -> FrameSet:
-    """The frames with their masks: those in `folder`, else those that the files name, else those beside the photos."""
+    """The frames with their masks: those in `folder`, else those that the files name, else those in `masks/`."""
     parts = [frame_set.frames, frame_set.test or ()]
     if folder is None and any(frame.mask for frames in parts for frame in frames):
         return frame_set

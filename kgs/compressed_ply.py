@@ -65,7 +65,7 @@ def save_compressed_ply(path: str | os.PathLike[str], model: GaussianModel, offs
     check_kind("model", model, GaussianModel)
     if not len(model):
         raise ArgumentError("model: expected at least one Gaussian, got none")
-    values = {name: parameter.detach().cpu().double().numpy() for name, parameter in model.named_parameters()}
+    values = {name: parameter.detach().cpu().double().numpy() for name, parameter in model.per_gaussian().items()}
     if offset is not None:
         values["means"] = values["means"] + as_vector("offset", offset)
     _check_finite(values)

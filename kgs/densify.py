@@ -64,10 +64,10 @@ class Densifier:
 
     Args:
         model: the Gaussians.
-        optimizer: ONE optimizer that holds each of the model's parameters (gsplat's dict of optimizers becomes one Adam
-            with a group for each); other parameters in it stay as they are. Its state for a
-            parameter consists of scalars and of tensors of that parameter's shape which start at 0: Adam, SGD,
-            RMSprop; not LBFGS or Adafactor.
+        optimizer: ONE optimizer that holds each of :meth:`GaussianModel.per_gaussian` (gsplat's dict of optimizers
+            becomes one Adam with a group for each); other parameters of model and optimizer stay as they are. Its
+            state for a parameter consists of scalars and of tensors of that parameter's shape which start at 0: Adam,
+            SGD, RMSprop; not LBFGS or Adafactor.
         extent: size of the camera rig in world units, > 0, see :func:`camera_extent`.
         grad_threshold: mean gradient from which a Gaussian is cloned or split, >= 0.
         absgrad: take the absolute gradients that renders with `RasterOptions.absgrad` leave; they are about four times
@@ -149,6 +149,7 @@ class Densifier:
         `absgrad` there is nothing to retain.
 
         Raises:
+            TypeError: `projected` is something else, as a whole `Rendering`.
             ValueError: `projected.means2d` has no gradient, or the number of Gaussians differs from the model's.
 
         Examples:
@@ -164,6 +165,7 @@ class Densifier:
             >>> densifier.observe(out.projected)
             >>> optimizer.step()
         """
+        check_kind("projected", projected, ProjectedGaussians)
         self._check_count()
         count = projected.num_gaussians
         expected = len(self.model)
@@ -206,10 +208,10 @@ class Densifier:
         split = (over & large).nonzero()[:, 0]
         unchanged = (opaque & ~(over & large)).nonzero()[:, 0]
         added = torch.cat([cloned, split.repeat(CHILDREN)])
-        new = {name: parameter.index_select(0, added) for name, parameter in model.named_parameters()}
+        new = {name: parameter.index_select(0, added) for name, parameter in model.per_gaussian().items()}
         new["means"][len(cloned) :] += self._sample_offsets(split.repeat(CHILDREN))
         new["log_scales"][len(cloned) :] -= math.log(SHRINK)
-        for name, parameter in list(model.named_parameters()):
+        for name, parameter in model.per_gaussian().items():
             self._replace(name, torch.cat([parameter.index_select(0, unchanged), new[name]]), unchanged)
         self._restart_statistics(self.mean_gradients[torch.cat([unchanged, added])])
         return DensifyReport(
@@ -290,7 +292,7 @@ class Densifier:
         """Raise a ValueError if the model, its statistics and the optimizer's state do not belong together."""
         self._check_count()
         held = {id(parameter) for group in self.optimizer.param_groups for parameter in group["params"]}
-        for name, parameter in self.model.named_parameters():
+        for name, parameter in self.model.per_gaussian().items():
             if id(parameter) not in held:
                 raise ArgumentError(
                     f"optimizer: expected it to hold all of the model's parameters, got none for {name}"

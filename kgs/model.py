@@ -127,13 +127,17 @@ class GaussianModel(nn.Module):
             sh_rest=points.new_zeros(n, SH_SIZES[sh_degree] - 1, 3),
         )
 
+    def per_gaussian(self) -> dict[str, nn.Parameter]:
+        """The parameters with a row for each Gaussian, by name: those of the class, and none that was added to it."""
+        return {name: self.get_parameter(name) for name in PARAMETERS}
+
     def select(self, rows: Tensor, sh_degree: int | None = None) -> "GaussianModel":
         """A new model of the Gaussians at `rows`: a mask `(N,)` or indices `(M,)`.
 
         `sh_degree` is the highest degree of the harmonics that are kept; None keeps all.
         """
         degree = self.max_sh_degree if sh_degree is None else _check_degree(sh_degree, self.max_sh_degree)
-        values = {name: parameter.detach()[rows] for name, parameter in self.named_parameters()}
+        values = {name: parameter.detach()[rows] for name, parameter in self.per_gaussian().items()}
         values["sh_rest"] = values["sh_rest"][:, : SH_SIZES[degree] - 1]
         return GaussianModel(**values, sh_degree=min(degree, self.sh_degree), antialiased=self.antialiased)
 

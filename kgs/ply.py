@@ -60,7 +60,7 @@ def save_ply(
     """
     check_kind("model", model, GaussianModel)
     bands = SH_SIZES[_degree_of_file(sh_degree, model)] - 1
-    values = {name: parameter.detach().cpu().numpy() for name, parameter in model.named_parameters()}
+    values = {name: parameter.detach().cpu().numpy() for name, parameter in model.per_gaussian().items()}
     means = values["means"].astype(np.float64)
     if offset is not None:  # adding zeros instead would lose the sign of -0.0
         means += as_vector("offset", offset)

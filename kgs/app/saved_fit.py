@@ -13,30 +13,27 @@ from kgs.app.files.publishing import complete
 from kgs.app.files.results_folder import CHECKPOINT
 from kgs.backends import get_backend
 from kgs.datasets.scene import Scene
-from kgs.fit.checkpoint import newest_checkpoint
-from kgs.fit.config import FitConfig
+from kgs.fit.checkpoint import errors_of, newest_checkpoint
+from kgs.fit.config import Settings
 from kgs.fit.decisions import Decisions
 from kgs.fit.exposure import with_exposure
 from kgs.fit.fit import Fit
 from kgs.fit.poses import with_extrinsics
-from kgs.fit.state import check_plain
+from kgs.fit.state import check_plain, state_errors
 from kgs.model import GaussianModel
 from kgs.types import RasterOptions
 
 from .scene_request import SceneRequest
 
+_HISTORY = ("steps", "seconds", "curve", "init", "poses")  # of metrics.json
 
-def read_settings(path: Path) -> tuple[SceneRequest, FitConfig]:
-    """The scene and the configuration in a fit's config.json; a DataError where it is wrong."""
-    settings = read_json(path)
-    for name in ("request", "fit"):
-        if not isinstance(settings.get(name), dict):
-            raise DataError(path, name, f"expected an object, got {str(settings.get(name, 'none'))[:60]!r}")
-    request = SceneRequest.from_dict(settings["request"], path)
-    try:
-        return request, FitConfig.from_dict(settings["fit"])
-    except ValueError as error:
-        raise DataError(path, "fit", str(error)) from error
+
+def read_request(path: Path) -> SceneRequest:
+    """How the scene of a fit was loaded, of its config.json; a DataError where it is wrong."""
+    values = read_json(path).get("request")
+    if not isinstance(values, dict):
+        raise DataError(path, "request", f"expected an object, got {str(values or 'none')[:60]!r}")
+    return SceneRequest.from_dict(values, path)
 
 
 def load_fit(
@@ -58,11 +55,16 @@ def load_fit(
         DataError: config.json, the checkpoint or the scene is missing, damaged, or does not fit the others.
     """
     complete(out)
-    request, settings = read_settings(out / "config.json")
+    request = read_request(out / "config.json")
     path = out / CHECKPOINT
     metrics = read_json(out / "metrics.json")
     values, damage = newest_checkpoint(path)
-    model = _read_model(path, values).to(device)
+    with errors_of(path), state_errors():
+        check_plain(values, "backend", "near_plane", "notes", "step")
+        settings = Settings.from_dict(values["config"])
+        model = GaussianModel(**values["model"])
+        part = values.get("shown", {})
+        model = (model.select(**part) if part else model).to(device)
     if backend == "auto":
         backend = get_backend(values["backend"], model.means.device, required=False).name
     if values["step"] != metrics.get("steps"):
@@ -71,26 +73,13 @@ def load_fit(
         raise DataError(path, "step", reason)
     if damage and say is not None:
         say(f"{damage}; the previous checkpoint is used")
+    with errors_of(out / "metrics.json"), state_errors():
+        history = {name: metrics[name] for name in _HISTORY}
+        decisions = Decisions.from_dict(metrics["decisions"])
     scene = _posed(_exposed(request.load(out, say), path, values), path, values)
     options = RasterOptions(near_plane=float(values["near_plane"]), max_bytes=settings.max_bytes)
-    return request, Fit(scene, model, options, backend, settings, metrics=metrics)
-
-
-def _read_model(path: Path, values: dict[str, Any]) -> GaussianModel:
-    """The Gaussians that a checkpoint shows."""
-    try:
-        check_plain(values, "backend", "near_plane", "step")
-    except KeyError as error:
-        raise DataError(path, str(error.args[0]), "expected this entry in a checkpoint, got none") from error
-    except ValueError as error:
-        field, _, reason = str(error).partition(": ")
-        raise DataError(path, field, reason) from error
-    try:
-        model = GaussianModel(**values["model"])
-        part = values.get("shown")
-        return model.select(**part) if part else model
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise DataError(path, "model", f"expected the Gaussians of a fit, got {error}") from error
+    fit = Fit(scene, model, options, backend, settings, history, decisions, metrics, tuple(values["notes"]), part)
+    return request, fit
 
 
 def _exposed(scene: Scene, path: Path, values: dict[str, Any]) -> Scene:

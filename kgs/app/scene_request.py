@@ -32,7 +32,7 @@ class SceneRequest:
         roll: degrees by which page and film are turned clockwise.
         title: of the page; "": the name of the folder.
         photo_folder: name of the folder of photos, as "images_8"; "": that of the largest.
-        masks: the folder of their masks; "": where the scene's files say, or beside the photos.
+        masks: the folder of their masks; "": where the scene's files say, or `masks/`.
         mask_mode: what black in a mask means, "ignore" or "transparent".
     """
 

@@ -7,10 +7,11 @@ under "state", next to the format and the SHA-256 of tensors and JSON. Loading m
 import hashlib
 import json
 import os
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from functools import reduce
 from operator import getitem
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -111,6 +112,16 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     if not isinstance(state, dict):
         raise DataError(path, "state", f"expected a dict, got a {type(state).__name__}")
     return state
+
+
+@contextmanager
+def errors_of(path: str | PathLike[str]) -> Iterator[None]:
+    """Turn a ValueError, which begins with the name of an entry, into an error about this file."""
+    try:
+        yield
+    except ValueError as error:
+        field, _, reason = str(error).partition(": ")
+        raise DataError(path, field, reason) from error
 
 
 def _digest_all(text: str, tensors: Mapping[str, Tensor]) -> str:

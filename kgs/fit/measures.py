@@ -47,16 +47,12 @@ def measure(fit: Fit, lpips: Lpips | None = None) -> dict[str, Any]:
         differ in exposure, "color_corrected" has the measures of test views after an affine fit of their colours.
 
     Raises:
-        ValueError: the fit has no settings, or no history, as one that was read from its folder.
+        ValueError: the fit has no settings.
     """
     scene = fit.scene
     config = fit.settings
     if config is None:
         raise ArgumentError("fit: expected a fit of kgs, which has settings, got a splat alone")
-    if not fit.history:
-        raise ArgumentError(
-            "fit: expected one that was just made, got one that was read from its folder: it has metrics"
-        )
     init = used_init(config.init, fit.history["init"]["kind"])
     init_note = _INIT_NOTES.get(init, "initial points that were given")
     if config.init in ("dense", "sift") and init in ("sift", "random") and init != config.init:

@@ -21,8 +21,8 @@ from kgs.init_points import InitialPoints
 from kgs.model import PARAMETERS, GaussianModel
 
 from .adam import Adam
-from .config import DROP, FitConfig
-from .plan import MANY, Plan, gaussian_limit
+from .config import Settings
+from .plan import Plan
 from .poses import MovingPoses
 
 # for each parameter the name of its learning rate in the recipe, without `lr_`
@@ -87,7 +87,7 @@ class TrainState:
         colors = points.colors.float()
         if scene.train.gains is not None and points.views is not None:
             colors = (colors / scene.train.gains[points.views]).clamp(0, 1)
-        model = GaussianModel.from_points(points.points.float(), colors, plan.config.sh_degree or 0)
+        model = GaussianModel.from_points(points.points.float(), colors, plan.config.sh_degree)
         model.sh_degree = 0
         start = Start(
             init={"kind": points.kind, "points": len(points.points)},
@@ -110,9 +110,8 @@ class TrainState:
         ]
         optimizer = Adam(groups, eps=recipe.adam_eps, backend=plan.backend)
         drop = None
-        rate = DROP if config.drop is None else config.drop
-        if rate:
-            drop = DropGaussian(rate, config.drop_schedule, seed=seed + 1, device=plan.device)
+        if config.drop:
+            drop = DropGaussian(config.drop, config.drop_schedule, seed=seed + 1, device=plan.device)
         densifier = Densifier(
             model,
             optimizer,
@@ -121,7 +120,7 @@ class TrainState:
             absgrad=recipe.absgrad,
             percent_dense=recipe.percent_dense,
             prune_opacity=recipe.prune_opacity,
-            max_gaussians=gaussian_limit(config, start.init["points"]),
+            max_gaussians=plan.max_gaussians,
             generator=torch.Generator().manual_seed(seed + 2),
             backend=plan.backend,
         )
@@ -171,7 +170,7 @@ class TrainState:
         """
         with state_errors():
             model = GaussianModel(**copy.deepcopy(values["model"]))
-            if model.max_sh_degree != (plan.config.sh_degree or 0) or model.means.dtype != torch.float32:
+            if model.max_sh_degree != plan.config.sh_degree or model.means.dtype != torch.float32:
                 given = f"{model.means.dtype} and degree {model.max_sh_degree}"
                 raise ArgumentError(
                     f"model: expected float32 and harmonics of degree {plan.config.sh_degree}, got {given}"
@@ -234,13 +233,14 @@ def digest(tensor: Tensor) -> str:
     return checksum.hexdigest()
 
 
-def check_saved(saved: dict[str, Any], scene: dict[str, Any], config: FitConfig, steps: int) -> list[str]:
+def check_saved(saved: dict[str, Any], scene: dict[str, Any], config: Settings) -> list[str]:
     """Raise KeyError, TypeError or ValueError unless a saved fit has this fingerprint, configuration and plain values.
 
     Returns notes for the user, if a finished fit goes on for more steps.
     """
     check_plain(saved, *PLAIN)
-    planned = saved["config"]["steps"] or MANY.steps
+    planned = saved["config"]["steps"]
+    steps = config.steps
     done = saved["step"]
     notes = list[str]()
     # a fit may continue on another device; its steps are compared below

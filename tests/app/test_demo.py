@@ -103,7 +103,7 @@ def demo(tmp_path_factory, points):
     """The results of a tiny demo, and what was said; nobody changes them."""
     out = tmp_path_factory.mktemp("demo") / "out"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("kgs.app.fit_folder.choose_points", lambda *_: points)
+        patch.setattr("kgs.fit.run.choose_points", lambda *_: points)
         assert run("demo", "-o", out, "--steps", 2, *TINY) == 0
     return out
 

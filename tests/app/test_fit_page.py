@@ -48,7 +48,7 @@ def fitted(points: Any, tmp_path_factory: Any) -> Any:
     scene = replace(synthetic_scene(train_views=3, test_views=8, size=(24, 32), seed=0), root=out)
     (out / "photos.json").write_text(json.dumps(REPORT))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(app, "choose_points", lambda *_: points)
+        patch.setattr("kgs.fit.run.choose_points", lambda *_: points)
         return out, app.fit_folder(scene, CONFIG, out, REQUEST, say=lambda line: None).fit
 
 

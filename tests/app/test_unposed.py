@@ -87,7 +87,7 @@ def test_a_folder_of_photos_becomes_a_fit(folder, tmp_path, capsys, monkeypatch)
     said = capsys.readouterr().out
     stages = ["1 of 5: cameras", "2 of 5: initial points", "3 of 5: fit", "4 of 5: film", "5 of 5: page"]
     assert [line for line in said.splitlines() if " of 5: " in line] == stages
-    assert said.index(stages[0]) < said.index("reconstruction.json is not used") < said.index(stages[1])
+    assert said.index(stages[0]) < said.index("reconstruction.json") < said.index(stages[1])
     assert "4 training photos of 96x72, none held out" in said
     assert "<title>photos4</title>" in (out / "index.html").read_text(encoding="utf-8")
     assert "no photo was held out" in said

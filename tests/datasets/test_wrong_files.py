@@ -121,7 +121,7 @@ LLFF = [
     ],
     (POSES, npy("(1, 17)", "|O"), f"{POSES}: "),
     (POSES, content(b"PK\x03\x04 no zip"), f"{POSES}: "),
-    ("masks/9.png", picture(12, 16), "masks/9.png: "),
+    ("masks/9.png", picture(12, 16), "masks: "),
     ("masks/0.png", picture(12, 10), "masks/0.png: "),
     ("masks/0.png", picture(12, 16, black=True), "masks/0.png: "),
     ("masks/0.png", picture(12, 16, kept_bytes=40), "masks/0.png: "),

@@ -123,7 +123,8 @@ def test_a_fit_turns_wrong_cameras_back():
     config = FitConfig(steps=150, seed=1, sh_degree=0, init_points=1500, max_gaussians=2000, evaluations=1)
     points = choose_points(wrong, config)
     fits = [
-        Trainer(wrong, make_plan(wrong, replace(config, refine_poses=moves)), points).fit() for moves in (False, True)
+        Trainer(wrong, make_plan(wrong, replace(config, refine_poses=moves), points), points).fit()
+        for moves in (False, True)
     ]
     fixed, moved = fits
     given, found = scene.train.cameras.extrinsics, moved.scene.train.cameras.extrinsics

@@ -98,9 +98,9 @@ def check_photos(
     if size is None and downscale is None:
         return
 
-    from kgs.datasets.image_file import read_size
+    from kgs.datasets.image_file import ImageFile
 
-    width, height = min(read_size(path) for path in paths)
+    width, height = min(ImageFile(path).size for path in paths)
     name = "size" if downscale is None else "downscale"
     factor = max(1.0, max(width, height) / size) if size is not None else downscale or 1.0
     reduced = [max(1, round(side / factor)) for side in (width, height)]

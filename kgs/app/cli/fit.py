@@ -90,8 +90,8 @@ def fit(
         background: the colour behind photos with transparency.
         frames: how many frames are taken from a video. Unless given: twelve, fewer where the camera moves little, more
             where it moves far.
-        masks: folder of masks, white where a photo is kept. Unless given: masks/ beside the photos, or
-            IMG_1_mask.png beside IMG_1.jpg.
+        masks: folder of masks, white where a photo is kept: IMG_1.png or IMG_1.jpg.png for IMG_1.jpg. Unless given:
+            masks/ beside the photos.
         mask_mode: what black in a mask means. ignore: these pixels do not count. transparent: empty space.
         preset: auto: what the training views need. paper: DropGaussian's rule and recipe, as published. plain: the same
             without dropping. See --preset paper --help-all.

@@ -31,11 +31,11 @@ def options_of_fit(ply: Path, source: SceneSource) -> dict[str, Any]:
 
     Empty if the splat does not lie in the folder of a fit to this scene, and the scene is not such a folder.
     """
-    from kgs.app.saved_fit import read_settings
+    from kgs.app.saved_fit import read_request
 
     for folder in (ply.parent, source.root):
         with suppress(DataError):  # there is no fit, or this is a file of another program
-            request, _ = read_settings(folder / "config.json")
+            request = read_request(folder / "config.json")
             if (folder / request.scene).resolve() == source.root.resolve():
                 masks = folder / request.masks if request.masks else None
                 names = ("downscale", "photo_folder", "mask_mode")

@@ -31,8 +31,8 @@ def poses(
         out: folder for the scene: images, sparse/0 (a COLMAP model) and photos.json (how the cameras were found).
         frames: how many frames are taken from a video. Unless given: twelve, fewer where the camera moves little, more
             where it moves far.
-        masks: folder of masks, white where a photo is kept. Unless given: masks/ beside the photos, or
-            IMG_1_mask.png beside IMG_1.jpg.
+        masks: folder of masks, white where a photo is kept: IMG_1.png or IMG_1.jpg.png for IMG_1.jpg. Unless given:
+            masks/ beside the photos.
         seed: of the solvers.
     """
     from kgs.app.files.publishing import UNFINISHED
