@@ -104,17 +104,15 @@ def photometric_loss(
         raise TypeError(f"moments: expected TargetMoments, got {type(moments).__name__}")
     if moments is not None and not _belong_to(moments, image):
         given = tuple(moments.padded.shape)
-        raise ArgumentError(f"moments: expected those of a target like image, {tuple(image.shape)}, got {given} padded")
+        raise ArgumentError("moments", f"those of a target like image, {tuple(image.shape)}", f"{given} padded")
     if isinstance(target, TargetMoments):
         target = target.padded[..., RADIUS:-RADIUS, RADIUS:-RADIUS].reshape(image.shape)
     _check_images(image, target)
     if not (math.isfinite(dssim_weight) and dssim_weight >= 0.0):
-        raise ArgumentError(f"dssim_weight: expected a finite number >= 0, got {dssim_weight}")
+        raise ArgumentError("dssim_weight", "a finite number >= 0", dssim_weight)
     outside = None if mask is None else _outside(mask, image)
     if dssim_weight != 0.0 and min(shape[-2:]) <= RADIUS:
-        raise ArgumentError(
-            f"image: expected at least {RADIUS + 1} x {RADIUS + 1} pixels, got {shape[-2]} x {shape[-1]}"
-        )
+        raise ArgumentError("image", f"at least {RADIUS + 1} x {RADIUS + 1} pixels", f"{shape[-2]} x {shape[-1]}")
     fast = fast and not target.requires_grad
     if table.loss is None or not fast or outside is not None or dssim_weight == 0.0 or min(shape[-2:]) < WINDOW:
         return _torch_loss(image, target, moments, dssim_weight, outside, fast)
@@ -137,7 +135,7 @@ def target_moments(target: Tensor, *, backend: str | Backend = "torch") -> Targe
     _check_images(target, target)
     table = get_backend(backend, target.device).covering("loss", target)
     if min(target.shape[-2:]) <= RADIUS:
-        raise ArgumentError(f"target: expected at least {RADIUS + 1} x {RADIUS + 1} pixels, got {tuple(target.shape)}")
+        raise ArgumentError("target", f"at least {RADIUS + 1} x {RADIUS + 1} pixels", tuple(target.shape))
     padded = F.pad(target.reshape(1, -1, *target.shape[-2:]), BORDER, mode="reflect")
     if table.local_moments is not None and min(target.shape[-2:]) >= WINDOW:
         return TargetMoments(padded, *table.local_moments(target, window_taps(target.dtype)))
@@ -280,12 +278,12 @@ def _outside(mask: Tensor, image: Tensor) -> Tensor:
     size = tuple(image.shape[-2:])
     shape = tuple(mask.shape) if isinstance(mask, Tensor) else type(mask).__name__
     if shape not in (size, (1, *size), (1, 1, *size), (images, 1, *size)):
-        raise ArgumentError(f"mask: expected shape {size}, {(1, *size)} or {(images, 1, *size)}, got {shape}")
+        raise ArgumentError("mask", f"shape {size}, {(1, *size)} or {(images, 1, *size)}", shape)
     outside = mask == 0
     if not bool((outside | (mask == 1)).all()):
-        raise ArgumentError("mask: expected True and False, or 0 and 1; for other values write mask > 0.5")
+        raise ArgumentError("mask", "True and False, or 0 and 1; for other values write mask > 0.5")
     if bool(outside.all()):
-        raise ArgumentError("mask: expected at least one pixel that counts, got none")
+        raise ArgumentError("mask", "at least one pixel that counts", "none")
     return outside.expand(images, 1, *size)
 
 
@@ -335,6 +333,6 @@ def _check_images(image: Tensor, target: Tensor) -> None:
         expected = f"{image.dtype} on {image.device}"
         raise TypeError(f"target: expected {expected} as image, got {target.dtype} on {target.device}")
     if image.ndim != 4 or image.numel() == 0:
-        raise ArgumentError(f"image: expected shape (B, C, H, W), each at least 1, got {tuple(image.shape)}")
+        raise ArgumentError("image", "shape (B, C, H, W), each at least 1", tuple(image.shape))
     if target.shape != image.shape:
-        raise ArgumentError(f"target: expected shape {tuple(image.shape)} as image, got {tuple(target.shape)}")
+        raise ArgumentError("target", f"shape {tuple(image.shape)} as image", tuple(target.shape))

@@ -160,7 +160,7 @@ def _check_out(out: Path, scene: Scene) -> None:
     try:
         check_folder(out, scene.root)
     except OSError as error:
-        raise DataError(out, "", f"expected a folder that results can be written to ({error.strerror})") from error
+        raise DataError(out, "", "a folder that results can be written to", advice=f"{error.strerror}") from error
 
 
 def _former(out: Path, resume: bool, say: Callable[[str], None]) -> Path | None:

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kgs._support.errors import DataError
+from kgs._support.errors import DataError, quoted
 from kgs._support.json_files import read_json
 from kgs.app.files.publishing import complete
 from kgs.app.files.results_folder import CHECKPOINT
@@ -32,7 +32,7 @@ def read_request(path: Path) -> SceneRequest:
     """How the scene of a fit was loaded, of its config.json; a DataError where it is wrong."""
     values = read_json(path).get("request")
     if not isinstance(values, dict):
-        raise DataError(path, "request", f"expected an object, got {str(values or 'none')[:60]!r}")
+        raise DataError(path, "request", "an object", quoted(values))
     return SceneRequest.from_dict(values, path)
 
 
@@ -69,8 +69,8 @@ def load_fit(
         backend = get_backend(values["backend"], model.means.device, required=False).name
     if values["step"] != metrics.get("steps"):
         whose = "that of the previous checkpoint, " if damage else ""
-        reason = f"expected that of metrics.json, {metrics.get('steps')}, got {whose}{values['step']}: resume the fit"
-        raise DataError(path, "step", reason)
+        expected = f"that of metrics.json, {metrics.get('steps')}"
+        raise DataError(path, "step", expected, f"{whose}{values['step']}", advice="resume the fit")
     if damage and say is not None:
         say(f"{damage}; the previous checkpoint is used")
     with errors_of(out / "metrics.json"), state_errors():
@@ -87,7 +87,7 @@ def _exposed(scene: Scene, path: Path, values: dict[str, Any]) -> Scene:
     try:
         return with_exposure(scene, Decisions.from_dict(values.get("decisions", {})))
     except (KeyError, TypeError, ValueError) as error:
-        raise DataError(path, "decisions", f"expected the gains of {len(scene.train)} photos: {error}") from error
+        raise DataError(path, "decisions", f"the gains of {len(scene.train)} photos", str(error)) from error
 
 
 def _posed(scene: Scene, path: Path, values: dict[str, Any]) -> Scene:
@@ -98,8 +98,8 @@ def _posed(scene: Scene, path: Path, values: dict[str, Any]) -> Scene:
     extrinsics = poses.get("extrinsics") if isinstance(poses, dict) else None
     if not (isinstance(extrinsics, Tensor) and extrinsics.shape[1:] == (4, 4)):
         given = tuple(extrinsics.shape) if isinstance(extrinsics, Tensor) else type(poses).__name__
-        raise DataError(path, "poses", f"expected extrinsics (V, 4, 4), got {given}")
+        raise DataError(path, "poses", "extrinsics (V, 4, 4)", given)
     if len(extrinsics) != len(scene.train):
-        reason = f"has {len(scene.train)} training views, but the fit has poses of {len(extrinsics)}: fit again"
-        raise DataError(scene.root, "train", reason)
+        expected = f"the {len(extrinsics)} training views of the fit"
+        raise DataError(scene.root, "train", expected, len(scene.train), advice="fit again")
     return with_extrinsics(scene, extrinsics)

@@ -14,7 +14,7 @@ from dataclasses import replace
 from torch import device as Device  # `import torch` would be taken for the folder of that name here
 from torch.compiler import is_compiling
 
-from kgs._support.errors import ArgumentError
+from kgs._support.errors import ArgumentError, quoted
 
 from .cpu import NUMBA
 from .gpu import TRITON
@@ -36,7 +36,7 @@ def check_backend(name: str | Backend) -> None:
     if isinstance(name, Backend) or name == "auto":
         return
     if name not in BACKENDS:
-        raise ArgumentError(f"backend: expected one of {available()}, got {name!r}")
+        raise ArgumentError("backend", f"one of {available()}", quoted(name))
     backend = BACKENDS[name]
     if backend.package and not backend.is_installed():
         package, how = backend.package
@@ -73,4 +73,4 @@ def _not_on(device: Device, named: Backend) -> ArgumentError:
     kernels = [backend.name for backend in BACKENDS.values() if backend.devices and backend.runs_on(device)]
     others = "".join(f'; "{name}" runs on {device}, too' for name in kernels)
     reason = f"which runs on {' and '.join(named.devices or ())} alone{others}"
-    return ArgumentError(f'backend: expected "auto" or "torch" on {device}, got "{named.name}", {reason}')
+    return ArgumentError("backend", f'"auto" or "torch" on {device}', f'"{named.name}", {reason}')

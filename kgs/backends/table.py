@@ -128,9 +128,7 @@ class Backend:
         if fits and like.dtype in self.dtypes and self.runs_on(like.device) and not torch.compiler.is_compiling():
             return self
         if self.is_named:
-            raise ArgumentError(
-                f'backend: {self.name!r} does not cover this call of {stage}, expected "auto" or "torch"'
-            )
+            raise ArgumentError("backend", f'"auto" or "torch" for this call of {stage}', f'"{self.name}"')
         return TORCH
 
     def covering_compositing(

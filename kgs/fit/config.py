@@ -11,7 +11,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self, get_args, get_origin, get_type_hints
 
-from kgs._support.errors import ArgumentError
+from kgs._support.errors import ArgumentError, quoted
 
 
 class _Range(NamedTuple):
@@ -112,7 +112,7 @@ class Recipe:
         _check(self)
         if self.reset_interval and self.reset_opacity <= self.prune_opacity:
             expected = f"above prune_opacity ({self.prune_opacity:g}), or a reset would remove all Gaussians"
-            raise ArgumentError(f"reset_opacity: expected a number {expected}, got {self.reset_opacity:g}")
+            raise ArgumentError("reset_opacity", f"a number {expected}", f"{self.reset_opacity:g}")
 
 
 @dataclass(frozen=True)
@@ -194,7 +194,7 @@ class FitConfig:
         _check(self)
         if (self.init == "file") != (self.init_file is not None):
             wanted = "a point cloud for" if self.init == "file" else "none without"
-            raise ArgumentError(f'init_file: expected {wanted} the init "file", got {self.init_file}')
+            raise ArgumentError("init_file", f'{wanted} the init "file"', self.init_file)
 
     def to_dict(self) -> dict[str, Any]:
         """The entries as plain values, for JSON and checkpoints."""
@@ -205,11 +205,11 @@ class FitConfig:
         """The inverse of `to_dict`; ValueError where an entry is unknown or out of range."""
         recipe = values.get("recipe", {}) if isinstance(values, dict) else None
         if not isinstance(recipe, dict):
-            raise ArgumentError(f"values: expected the entries of a {cls.__name__}, got {str(values)[:60]!r}")
+            raise ArgumentError("values", f"the entries of a {cls.__name__}", quoted(values))
         kind = get_type_hints(cls)["recipe"]
         for owner, entries in ((cls, values), (kind, recipe)):
             if unknown := sorted({*map(str, entries)} - {entry.name for entry in fields(owner)}):
-                raise ArgumentError(f"values: expected the entries of a {owner.__name__}, got {unknown[0]!r}")
+                raise ArgumentError("values", f"the entries of a {owner.__name__}", quoted(unknown[0]))
         return cls(**{**values, "recipe": kind(**recipe)})
 
 
@@ -260,7 +260,7 @@ def _check(config: FitConfig | Recipe) -> None:
             continue
         converted, expected = _convert(value, hint)
         if converted is None:
-            raise ArgumentError(f"{entry.name}: expected {expected}, got {str(value)[:60]!r}")
+            raise ArgumentError(entry.name, expected, quoted(value))
         object.__setattr__(config, entry.name, converted)
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from os import PathLike
 from typing import Any
 
-from kgs._support.errors import DataError
+from kgs._support.errors import DataError, quoted
 from kgs._support.progress import ProgressBar, silent
 from kgs.datasets.scene import Scene
 from kgs.init_points import InitialPoints, initial_points
@@ -95,8 +95,7 @@ def check_before_points(scene: Scene, config: FitConfig, lpips: bool = False) ->
     for views in (scene.train, scene.test):
         height, width = views.images.shape[-2:]
         if min(height, width) < smallest:
-            reason = f"expected at least {smallest}x{smallest} pixels, got {width}x{height}"
-            raise DataError(scene.root, "images", reason)
+            raise DataError(scene.root, "images", f"at least {smallest}x{smallest} pixels", f"{width}x{height}")
 
 
 def choose_points(scene: Scene, config: FitConfig, bar: ProgressBar = silent) -> InitialPoints:
@@ -113,11 +112,11 @@ def choose_points(scene: Scene, config: FitConfig, bar: ProgressBar = silent) ->
     kind = config.init
     if kind in ("scene", "model-points"):
         if len(scene.points) == 0:
-            reason = f"expected points of the layout itself for the init {kind!r}, got none"
-            raise DataError(scene.root, "points", reason)
+            raise DataError(scene.root, "points", f"points of the layout itself for the init {kind!r}", "none")
         if (kind == "model-points") != (scene.init_kind == "model-points"):
-            reason = f"expected points for the init {kind!r}, got {scene.init_kind!r}: load_scene(points=...) chooses"
-            raise DataError(scene.root, "points", reason)
+            expected = f"points for the init {kind!r}"
+            advice = "load_scene(points=...) chooses"
+            raise DataError(scene.root, "points", expected, quoted(scene.init_kind), advice=advice)
         check_in_view(scene.points, scene.train, scene.root)
         return InitialPoints(scene.points, scene.point_colors, scene.init_kind)
     views = scene.train if scene.train_full_size is None else scene.train_full_size

@@ -52,7 +52,7 @@ def scaled(fit: Fit, factor: float) -> Fit:
 
 def _check(factor: float) -> None:
     if not (math.isfinite(factor) and factor > 0):
-        raise ArgumentError(f"factor: expected a finite number above 0, got {factor}")
+        raise ArgumentError("factor", "a finite number above 0", factor)
 
 
 def _scaled_scene(scene: Scene, factor: float) -> Scene:

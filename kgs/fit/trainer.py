@@ -165,7 +165,7 @@ class Trainer:
         state = self.state
         schedule = self.plan.schedule
         if state.step >= schedule.steps:
-            raise ArgumentError(f"steps: expected a step of {schedule.steps} to be left, got none")
+            raise ArgumentError("steps", f"a step of {schedule.steps} to be left", "none")
         start = time.perf_counter()
         with threads_beside(self.plan.backend), torch.enable_grad():
             loss = self._optimize()

@@ -126,7 +126,7 @@ def _start(
     if name == SYNTHETIC:
         scene = synthetic_scene(train_views=views, size=(72, 96))
     elif data is None:
-        raise DataError(name, "", "expected the environment variable KGS_DATA to name the folder of this scene")
+        raise DataError(name, "", "the environment variable KGS_DATA to name the folder of this scene")
     else:
         points_of = start if start == "model-points" else "none"
         source = SceneSource(Path(data) / name)

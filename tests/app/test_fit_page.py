@@ -173,7 +173,7 @@ def done(measured: Path, tmp_path: Path) -> Path:
 def test_eval_refuses_a_page_that_the_user_changed(done: Path, capsys: Any) -> None:
     page = (done / "index.html").read_bytes()
     (done / "index.html").write_text("mine")
-    with pytest.raises(DataError, match=r"holds index\.html, which this command did not write"):
+    with pytest.raises(DataError, match=r"got index\.html: move it away"):
         evaluate(done)
     (done / "index.html").write_bytes(page)
     evaluate(done)

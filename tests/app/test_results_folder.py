@@ -192,7 +192,7 @@ def test_a_forged_checkpoint_is_refused(done: Path, changes: dict[str, Any], fie
     previous(path).unlink(missing_ok=True)
     with pytest.raises(DataError) as error:
         load_fit(done)
-    assert (error.value.path, error.value.field) == (path, field)
+    assert (error.value.path, error.value.key) == (path, field)
 
 
 def killed_before_the_move(out: Path, patch: Any) -> None:
@@ -336,7 +336,7 @@ def test_an_unfinished_fit_is_gone_on_with_or_the_next_one_is_refused(scene: Any
     before = contents(done)
     for check in (lambda: fit(scene, OTHER, done), lambda: check_fit_files(done, resume=False)):
         with pytest.raises(
-            DataError, match="holds a fit that is not done: go on with it by --resume, or remove"
+            DataError, match="a fit that is done, got one that is not: go on with it by --resume, or remove"
         ) as error:
             check()
         assert error.value.path == work
@@ -365,10 +365,10 @@ def test_a_file_that_the_user_writes_during_a_fit_is_not_replaced_and_no_trainin
 
     with monkeypatch.context() as patch:
         patch.setattr(Trainer, "_optimize", meanwhile)
-        with pytest.raises(DataError, match=f"holds {mine.name}, which this command did not write"):
+        with pytest.raises(DataError, match=f"got {mine.name}: move it away"):
             fit(scene, OTHER, done)
     assert json.loads((done / "metrics.json").read_text())["seed"] == 0
-    with pytest.raises(DataError, match=f"holds {mine.name}, which"):
+    with pytest.raises(DataError, match=f"got {mine.name}: move it away"):
         fit(scene, OTHER, done, resume=True)
     assert mine.read_text() == "mine"
     mine.unlink()

@@ -170,9 +170,9 @@ def test_poses_of_other_photos_are_refused(refined, tmp_path):
     values = load_checkpoint(out / CHECKPOINT)
     values["poses"]["extrinsics"] = values["poses"]["extrinsics"][1:]
     save_checkpoint(out / CHECKPOINT, values)
-    with pytest.raises(DataError, match="training views, but the fit has poses of") as error:
+    with pytest.raises(DataError, match="training views of the fit") as error:
         load_fit(out)
-    assert error.value.field == "train"
+    assert error.value.key == "train"
 
 
 def test_decayed():

@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from refusals import refused
 
 from kgs._support.errors import DataError
 from kgs.app.saved_fit import read_request
@@ -37,6 +38,5 @@ WRONG |= {"background": ("red",), "points": (["none"],), "photos": (1,), "roll":
 )
 def test_wrong_requests_are_named(tmp_path, request_, field):
     path = written(tmp_path / "config.json", request_)
-    with pytest.raises(DataError, match="expected") as error:
+    with refused(DataError, path=path, key=field):
         read_request(path)
-    assert (error.value.path, error.value.field) == (path, field)
