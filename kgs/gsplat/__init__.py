@@ -7,9 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kgs.backends.base import CompositingCall
+from kgs.backends import get_backend
 from kgs.renderer import blend
-from kgs.stages import composite_call, project
+from kgs.stages import project, rasterize
 from kgs.types import RasterOptions
 
 from .arguments import as_kgs, check_words, refuse
@@ -68,7 +68,7 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
     alpha_threshold: float = RasterOptions.alpha_threshold,
     transmittance_stop: float = RasterOptions.transmittance_stop,
     max_bytes: int | None = RasterOptions.max_bytes,
-    backend: str = "auto",
+    backend: str | Backend = "auto",
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render N Gaussians in C cameras; a drop-in for `gsplat.rasterization` of gsplat 1.6, and of 1.5 by name.
 
@@ -160,7 +160,8 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
         sh_degree=sh_degree,
     )
     is_shared = has_image and features_per_camera is None
-    projected = project(gaussians, cameras, options=options, colors=is_shared, backend=backend)
+    table = get_backend(backend, means.device)
+    projected = project(gaussians, cameras, options=options, colors=is_shared, backend=table)
     pairs = Pairs(projected, len(viewmats), len(gaussians), packed)
     half = 0.5 if pixel_centers == "half" else 0.0
     means2d = pairs.spread(projected.means2d + half)
@@ -171,11 +172,11 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
     if render_mode.endswith("D"):
         features.append(projected.depths[:, None])
     hook = pairs.absgrad_hook(means2d) if absgrad else None
-    composited = composite_call(CompositingCall(projected, torch.cat(features, 1), options), backend, hook)
+    composited = rasterize(projected, torch.cat(features, 1), options, table, absgrad_hook=hook)
     alphas = 1.0 - composited.transmittance
     images = list(composited.features.split([x.shape[1] for x in features], 1))
     if has_image:
-        images[0] = blend(images[0], composited.transmittance, backgrounds, backend, "backgrounds")
+        images[0] = blend(images[0], composited.transmittance, backgrounds, table, "backgrounds")
     if render_mode.endswith("ED"):
         images[-1] = images[-1] / alphas.clamp_min(1e-10)
     tile = composited.tile_size
