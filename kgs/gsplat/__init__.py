@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kgs.backends import get_backend
+from kgs.backends import Backend, get_backend
 from kgs.renderer import blend
 from kgs.stages import project, rasterize
 from kgs.types import RasterOptions
