@@ -9,7 +9,7 @@ from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
-from kgs._support.errors import DataError, listed
+from kgs._support.errors import DataError, listed, quantity
 
 _JPEG = (".jpg", ".jpeg", ".jpe", ".jfif", ".jif", ".pjpeg", ".pjp")
 IMAGE_SUFFIXES = (".png", *_JPEG, ".webp", ".bmp", ".dib", ".tif", ".tiff")
@@ -88,7 +88,7 @@ def image_folder(root: Path, name: str = "") -> Path | None:
     With a name the folder of that name; a DataError where there is none.
     """
     if name and not (root / name).is_dir():
-        raise DataError(root, "", f"expected the photos in {name}/, found no such folder")
+        raise DataError(root, "", f"the photos in {name}/", "no such folder")
     if name or (root / "images").is_dir():
         return root / (name or "images")
     reduced = [p for p in root.glob("images_*") if p.is_dir() and p.name.removeprefix("images_").isdecimal()]
@@ -154,19 +154,21 @@ def scene_nearby(root: Path) -> Path | None:
     return next(filter(layout_of, others), None)
 
 
-def why_no_scene(root: Path) -> str:
-    """Why a file or folder is not a scene, and what to do."""
+def no_scene(root: Path) -> DataError:
+    """The error about a file or folder that is not a scene, which says what to do."""
     if not root.exists():
-        return "expected a folder, there is none"
+        return DataError(root, "", "a folder", "none")
+    got = "another folder" if root.is_dir() else "a file"
     if folder := scene_nearby(root):
-        return f"is not a scene, but {folder} is one: give that folder"
+        return DataError(root, "", "a scene", got, advice=f"{folder} is one: give that folder")
     if not root.is_dir():
-        return "expected a folder, got a file"
+        meant = f"for photos, name their folder: {root.parent}" if root.suffix.lower() in PICTURE_SUFFIXES else ""
+        return DataError(root, "", "a folder", "a file", advice=meant)
+    advice = f"there is no {', '.join(LAYOUT_FILES.values())} or COLMAP model in sparse/0"
     if count := len(list_images(image_folder(root) or root, PICTURE_SUFFIXES)):
-        found = f"has {count} photos but no camera poses: kgs fit finds them, or COLMAP (its model goes to sparse/0)"
-    else:
-        found = f"is not a scene: looked for {', '.join(LAYOUT_FILES.values())} and a COLMAP model in sparse/0"
-    return ". ".join([found, *unused_files(root)])
+        got = f"{quantity(count, 'photo')} without camera poses"
+        advice = "kgs fit finds them, or COLMAP (its model goes to sparse/0)"
+    return DataError(root, "", "a scene", got, advice=". ".join([advice, *unused_files(root)]))
 
 
 def has_photos(scene: Path) -> bool:

@@ -22,7 +22,7 @@ from PIL.ExifTags import IFD, Base
 from PIL.Image import Exif
 from PIL.ImageFile import ImageFile as Opened
 
-from kgs._support.errors import DataError, listed
+from kgs._support.errors import DataError, cause_of, listed
 from kgs._support.extras import check_opencv
 
 from . import folders
@@ -104,7 +104,7 @@ class ImageFile:
                 with file:
                     self._metadata = _read_header(self.path, file)
             except OSError as error:
-                raise DataError(self.path, "", f"cannot be read ({error.strerror})") from error
+                raise DataError(self.path, "", "a file that can be read", advice=f"{error.strerror}") from error
         return self._metadata
 
     def read(self) -> Image:
@@ -121,10 +121,11 @@ class ImageFile:
         except MemoryError:
             raise
         except Exception as error:  # neither Pillow, Kornia nor OpenCV has one class of errors for damage
-            raise DataError(self.path, "", f"cannot be decoded: damaged or cut short ({error})") from error
+            advice = cause_of(error)
+            raise DataError(self.path, "", "an image", "one that is damaged or cut short", advice=advice) from error
         height, width = pixels.shape[:2]
         if metadata.size != (width, height):
-            raise DataError(self.path, "", f"expected {metadata.size} pixels as its header says, got {(width, height)}")
+            raise DataError(self.path, "", f"{metadata.size} pixels as its header says", (width, height))
         self._data = None
         return to_srgb(np.asarray(pixels / np.float32(2 ** max(8, metadata.bits) - 1), np.float32), metadata.profile)
 
@@ -148,7 +149,7 @@ def read_bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise DataError(path, "", f"cannot be read ({error.strerror})") from error
+        raise DataError(path, "", "a file that can be read", advice=f"{error.strerror}") from error
 
 
 def is_heic(data: bytes) -> bool:
@@ -171,14 +172,14 @@ def _plugin(path: Path, file: IO[bytes]) -> type[Opened]:
     head = file.read(12)
     file.seek(0)
     if not head:
-        raise DataError(path, "", "expected an image, got an empty file")
+        raise DataError(path, "", "an image", "an empty file")
     plugin = next((plugin for signature, plugin in _PLUGINS.items() if head.startswith(signature)), None)
     if is_heic(head) and folders.has_heic():
         import pi_heif
 
         plugin = pi_heif.HeifImageFile
     if plugin is None:
-        raise DataError(path, "", "cannot be decoded: expected a PNG, JPEG, WebP, BMP or TIFF image")
+        raise DataError(path, "", "a PNG, JPEG, WebP, BMP or TIFF image", "another file")
     return plugin
 
 
@@ -203,15 +204,15 @@ def _read_header(path: Path, file: IO[bytes]) -> Metadata:
             if int(tags.get(Base.Orientation, 1)) in (5, 6, 7, 8):
                 size = size[::-1]  # Pillow gives that of the upright image
     except Exception as error:  # damaged bytes raise whatever Pillow's plugins happen to raise
-        reason = f"cannot be decoded: damaged, cut short, or an unusual {plugin.format} ({error})"
-        raise DataError(path, "", reason) from error
+        got = f"a {plugin.format} that is damaged, cut short or unusual"
+        raise DataError(path, "", "an image", got, advice=cause_of(error)) from error
     _check_size(path, *size, length)
     _check_size(path, *tile, length)  # tiles are decoded whole
     try:
         _check_samples(image, bits)
         profile = _profile(image, chunks.get(b"cICP", b""), tags)
     except ValueError as error:
-        raise DataError(path, "", f"expected grey or RGB of 8 bits, got {error}: convert it to 8-bit RGB") from error
+        raise DataError(path, "", "grey or RGB of 8 bits", str(error), advice="convert it to 8-bit RGB") from error
     return Metadata(size, bits, tags, profile)
 
 
@@ -249,11 +250,13 @@ def _tags(image: Opened) -> dict[int, Any]:
 def _check_size(path: Path, width: int, height: int, size: int) -> None:
     """Raise DataError about `path` if so many pixels should not be decoded from a file of `size` bytes."""
     if width < 1 or height < 1:
-        raise DataError(path, "header", f"expected an image of at least 1x1 pixels, got {width}x{height}")
+        raise DataError(path, "header", "an image of at least 1x1 pixels", f"{width}x{height}")
     # Photos have fewer than 20 pixels per byte, a PNG of one colour 1032. Any file may have 2^21 pixels (48 MiB while
     # decoded); images of one colour may have 2^24 (384 MiB). More, up to 2^28, need a byte for every 32.
-    if width * height > min(2**28, max(2**21, min(2**24, 2048 * size), 32 * size)):
-        raise DataError(path, "header", f"claims {width}x{height} pixels in {size} bytes: a decompression bomb")
+    max_pixels = min(2**28, max(2**21, min(2**24, 2048 * size), 32 * size))
+    if width * height > max_pixels:
+        expected = f"at most {max_pixels} pixels in {size} bytes"
+        raise DataError(path, "header", expected, f"{width}x{height}", advice="it is a decompression bomb")
 
 
 def _check_samples(image: Opened, bits: int) -> None:

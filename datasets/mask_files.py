@@ -46,7 +46,7 @@ def find_mask_files(photos: Sequence[Path], root: Path, folder: Path | None = No
             photos, or two fit one.
     """
     if folder is not None and not folder.is_dir():
-        raise DataError(folder, "", "expected a folder of masks, found no such folder")
+        raise DataError(folder, "", "a folder of masks", "no such folder")
     parents = sorted({photo.parent for photo in photos})
     between = {outer for parent in parents for outer in parent.parents if outer.is_relative_to(root)}
     outer_folders = sorted({root, *parents, *between})
@@ -59,9 +59,9 @@ def find_mask_files(photos: Sequence[Path], root: Path, folder: Path | None = No
         found = _fitting(inner, files, own)
         if not found and (files or folder):
             got = listed([path.relative_to(inner) for path in files]) or "nothing"
-            raise DataError(inner, "", f"expected pictures with the stems or names of photos, got {got}")
+            raise DataError(inner, "", "pictures with the stems or names of photos", got)
         for photo in found.keys() & masks.keys():
-            raise DataError(found[photo], "", f"expected one mask of {photo.name}, got {masks[photo]} too")
+            raise DataError(found[photo], "", f"one mask of {photo.name}", f"{masks[photo]} too")
         masks |= found
         lost += [path for path in files if path not in found.values()]
     known = {*photos, *masks.values(), *lost}
@@ -83,9 +83,9 @@ def _fitting(folder: Path, files: Iterable[Path], photos: Iterable[Path]) -> dic
         alike = by_name.get(mask.stem.lower(), []) if mask.suffix.lower() in IMAGE_SUFFIXES else []
         fitting = [photo for photo in alike if _lower(photo.parent)[-len(inner) :] == inner or not inner]
         if len(fitting) > 1:
-            raise DataError(mask, "", f"expected a mask of one photo, it fits {fitting[0]} and {fitting[1]}")
+            raise DataError(mask, "", "a mask of one photo", f"one that fits {fitting[0]} and {fitting[1]}")
         if fitting and fitting[0] in found:
-            raise DataError(mask, "", f"expected one mask of {fitting[0].name}, got {found[fitting[0]].name} too")
+            raise DataError(mask, "", f"one mask of {fitting[0].name}", f"{found[fitting[0]].name} too")
         found |= dict.fromkeys(fitting, mask)
     return found
 

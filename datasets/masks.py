@@ -30,12 +30,12 @@ class Mask(NamedTuple):
         values = pixels[..., :3].mean(axis=2) * (pixels[..., 3] if pixels.shape[2] == 4 else 1.0)
         rows, columns = values.shape
         if not Intrinsics(columns, rows, 1, 1, 0, 0).same_aspect(width, height):
-            reason = f"expected the shape of {photo.name}, {width}x{height}, got {columns}x{rows}"
-            raise DataError(self.file.path, "", reason)
+            expected = f"the shape of {photo.name}, {width}x{height}"
+            raise DataError(self.file.path, "", expected, f"{columns}x{rows}")
         white = float(values.max())
         if values.min() == white < 1:
             value = white * (2 ** max(8, self.file.metadata.bits) - 1)
-            raise DataError(self.file.path, "", f"expected black and white pixels, got the value {value:g} everywhere")
+            raise DataError(self.file.path, "", "black and white pixels", f"the value {value:g} everywhere")
         kept = np.asarray(values > 0.5 * white, np.float32)
         if (columns, rows) == (width, height):
             return kept

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Self
 
-from kgs._support.errors import DataError
+from kgs._support.errors import DataError, quoted
 from kgs._support.json_files import is_number
 from kgs.datasets.load import load_scene
 from kgs.datasets.options import MASK_MODES
@@ -103,8 +103,8 @@ class SceneRequest:
         for name, (expected, is_right) in _EXPECTED.items():
             value = getattr(request, name)
             if not is_right(value):
-                got = f"{value!r}"[:60] if name in values else "none"
-                raise DataError(path, f"request.{name}", f"expected {expected}, got {got}")
+                got = quoted(value) if name in values else "none"
+                raise DataError(path, f"request.{name}", expected, got)
         return replace(request, roll=float(request.roll))
 
 

@@ -83,7 +83,7 @@ def test_jpegs_that_libjpeg_warns_of_are_refused(
         cv2.imdecode(np.frombuffer(damaged, np.uint8), cv2.IMREAD_UNCHANGED)
         if capfd.readouterr().err:
             warned += 1
-            with pytest.raises(DataError, match=r"a\.jpg: cannot be decoded: damaged"):
+            with pytest.raises(DataError, match=r"a\.jpg: .* got one that is damaged"):
                 read_image(stored(tmp_path / "a.jpg", damaged))
     assert warned >= 8
 
@@ -242,7 +242,7 @@ def test_a_compression_that_opencv_lacks_is_refused_in_one_line(
 ) -> None:
     file = io.BytesIO()
     PIL.Image.fromarray(DEEP[..., 0]).save(file, "TIFF", compression=compression)
-    with pytest.raises(DataError, match="cannot be decoded"):
+    with pytest.raises(DataError, match="expected an image"):
         read_image(stored(tmp_path / "a.tif", file.getvalue()))
     assert capfd.readouterr() == ("", "")
 
@@ -275,7 +275,7 @@ def test_the_plainest_real_image_is_read(tmp_path: Path) -> None:
 def test_bombs_are_refused_before_they_are_decoded(tmp_path: Path, width: int, height: int) -> None:
     path = tmp_path / "bomb.png"
     path.write_bytes(png_of(zlib.compress(bytes(72)), width, height))
-    with pytest.raises(DataError, match=rf"bomb\.png.*claims {width}x{height} pixels"):
+    with pytest.raises(DataError, match=rf"bomb\.png: header: .*, got {width}x{height}"):
         read_image(path)
 
 
@@ -289,7 +289,7 @@ def test_cut_headers_are_data_errors(tmp_path: Path, suffix: str) -> None:
         with contextlib.suppress(DataError):
             assert ImageFile(path).size == (5, 4)
     path.write_bytes(data[:3])
-    with pytest.raises(DataError, match="decoded"):
+    with pytest.raises(DataError, match="expected an image|expected a PNG"):
         _ = ImageFile(path).size
 
 

@@ -18,10 +18,10 @@ from kgs.datasets import load_scene
 PHOTOS = ["0.jpg", "1.jpg", "2.jpg"]
 WITHOUT_POSES = [
     ([], r"poses_bounds\.npy.*transforms_train\.json.*transforms\.json.*sparse/0"),
-    (["notes.txt", "._IMG_1.HEIC"], r"is not a scene: looked for poses_bounds\.npy"),
-    (["IMG_1.HEIC", "b.avif"], "2 photos but no camera poses"),
-    (["walk.MP4"], "is not a scene"),
-    (PHOTOS, "3 photos but no camera poses.*COLMAP"),
+    (["notes.txt", "._IMG_1.HEIC"], r"expected a scene, got another folder: there is no poses_bounds\.npy"),
+    (["IMG_1.HEIC", "b.avif"], "2 photos without camera poses"),
+    (["walk.MP4"], "expected a scene, got another folder"),
+    (PHOTOS, "3 photos without camera poses.*COLMAP"),
 ]
 # the first of these that is there is read, and these are empty files
 IN_ORDER = [
@@ -35,7 +35,7 @@ IN_ORDER = [
         "COLMAP model is not used: expected its photos beside it or in images/",
     ),
     *[
-        ([*PHOTOS, other], rf"3 photos but no camera poses.*\. cameras in {other}")
+        ([*PHOTOS, other], rf"3 photos without camera poses.*\. cameras in {other}")
         for other in ("reconstruction.json", "transform_train.json", "scan.XML", "0.xmp", "cameras.csv", "cameras.json")
     ],
 ]
@@ -62,7 +62,7 @@ def test_what_is_no_scene_is_named(tmp_path: Path, names: list[str], message: st
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("nowhere", "there is none"),
+        ("nowhere", "expected a folder, got none"),
         ("scene.zip", "got a file"),
     ],
 )

@@ -182,7 +182,7 @@ def test_photos_that_are_missing_are_named_beside_masks_too(tmp_path: Path) -> N
     in_the_file(tmp_path)
     update_json(tmp_path / "transforms.json", 0, file_path="gone/0.png", mask_path="")
     write_mask(tmp_path / "masks" / "1.png")
-    with pytest.raises(DataError, match="images are missing"):
+    with pytest.raises(DataError, match="there is no"):
         load_scene(tmp_path, hold_out=0)
 
 

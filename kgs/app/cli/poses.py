@@ -39,12 +39,14 @@ def poses(
     from kgs.app.files.results_folder import has_fit
 
     if open_scene(photos) is not None:
-        raise DataError(photos, "", "has camera poses: kgs fit takes it as it is")
+        raise DataError(photos, "", "photos without camera poses", "a scene", advice="kgs fit takes it as it is")
     check_frames(frames, photos)
     check_installed("pycolmap")
     check_photos(photos, out, frames=frames)
     if has_fit(out) or has_fit(out / UNFINISHED):
-        raise DataError(out, "", "holds a fit, to which its cameras belong: choose another folder")
+        raise DataError(
+            out, "", "a folder without a fit", "one, to which its cameras belong", advice="choose another folder"
+        )
     load_tools()
 
     from kgs.app.sfm import pose_photos

@@ -121,7 +121,7 @@ def accepted_cameras(
         geometries = {pair: geometry for pair, geometry in geometries.items() if rejected.keys().isdisjoint(pair)}
         kept = {image: name for image, name in names.items() if name not in rejected}
         if reason := why_no_cameras(list(kept.values()), pairs, geometries):
-            raise PhotosRefused(folder, "", reason)
+            raise PhotosRefused(folder, "", "photos whose cameras can be found", advice=reason)
         are_known = all(lens.has_prior_focal_length for lens in lenses)
         known = [lens.focal_length for lens in lenses] if are_known else []
         consensus = Consensus((first, second), second_matches, executor, known, pairs)
@@ -366,8 +366,8 @@ def check(
     """
 
     def refuse(reason: str, advice: str) -> NoReturn:
-        said = f"no cameras that can be trusted: {reason}.\n{_FORWARD if forward else advice}"
-        raise PhotosRefused(folder, "", f"{said}.\n{table(names, pairs)}")
+        said = f"{reason}.\n{_FORWARD if forward else advice}.\n{table(names, pairs)}"
+        raise PhotosRefused(folder, "", "photos whose cameras can be trusted", advice=said)
 
     missing = [name for name in names if any(name not in cameras.points for cameras in solutions)]
     registered = [name for name in names if name not in missing]

@@ -40,29 +40,28 @@ def find_photos(folder: Path) -> list[Path]:
         DataError: the folder does not exist, it holds fewer than 3 photos, or photos of a kind that cannot be read.
     """
     if not folder.is_dir():
-        raise DataError(folder, "", "expected a folder of photos, found no such folder")
+        raise DataError(folder, "", "a folder of photos", "no such folder")
     paths = list_photos(folder)
     converted = _converted(folder)
     if lost := [path for path in list_images(folder, PICTURE_SUFFIXES) if not path.exists() and path not in converted]:
-        raise DataError(folder, "", f"expected photos, got links to files that are not there: {listed_files(lost)}")
+        raise DataError(folder, "", "photos", "links to files that are not there", advice=listed_files(lost))
     files = [path for path in sorted(folder.iterdir()) if path.is_file() and not path.name.startswith(".")]
     videos = [path for path in files if _is_video(path)]
     unreadable = set(UNREADABLE_SUFFIXES).difference(_readable())
     if others := [path for path in files if path.suffix.lower() in unreadable and path not in converted]:
-        wrong = f"{len(others)} of {len(others) + len(paths)} photos cannot be read ({listed_files(others)}). "
-        raise DataError(folder, "", wrong + CONVERT)
+        got = f"{len(others)} of {len(others) + len(paths)} of another kind ({listed_files(others)})"
+        raise DataError(folder, "", "photos that can be read", got, advice=CONVERT)
     if not paths and videos:
-        raise DataError(folder, "", f"holds no photos but several videos ({listed_files(videos)}): name one of them")
+        raise DataError(folder, "", "photos or a video", f"videos ({listed_files(videos)})", advice="name one of them")
     if not paths:
         deeper = [path for path in sorted(folder.iterdir()) if path.is_dir() and _holds_photos(path)]
-        if deeper:
-            reason = f"holds no photos itself, but these folders in it do: {listed_files(deeper)}. Name one of them"
-        else:
-            reason = f"expected photos ({' '.join(_readable())}), found none. {ADVICE}"
-        raise DataError(folder, "", ". ".join([reason, *folders.unused_files(folder), *_nameless(folder)]))
+        inner = f"these folders in it hold some: {listed_files(deeper)}. Name one of them"
+        advice = ". ".join([inner if deeper else ADVICE, *folders.unused_files(folder), *_nameless(folder)])
+        raise DataError(folder, "", f"photos ({' '.join(_readable())})", "none", advice=advice)
     if len(paths) < MIN_PHOTOS:
-        reason = f"expected at least {MIN_PHOTOS} photos, found {len(paths)} ({listed_files(paths)}). {ADVICE}"
-        raise DataError(folder, "", ". ".join([reason, *_nameless(folder)]))
+        advice = ". ".join([ADVICE, *_nameless(folder)])
+        got = f"{len(paths)} ({listed_files(paths)})"
+        raise DataError(folder, "", f"at least {MIN_PHOTOS} photos", got, advice=advice)
     return paths
 
 

@@ -102,7 +102,7 @@ def without_overlap(
 
 
 def why_no_cameras(names: Sequence[str], pairs: Pairs, geometries: Mapping[tuple[str, str], PairGeometry]) -> str:
-    """Why matches cannot give cameras, and what to photograph next, as an error message; "" if they can.
+    """Why matches cannot give cameras, and what to photograph next, as the advice of an error; "" if they can.
 
     Args:
         names: the names of all photos.
@@ -129,7 +129,7 @@ def why_no_cameras(names: Sequence[str], pairs: Pairs, geometries: Mapping[tuple
         reason = f"the photos fall into {len(groups)} groups that do not overlap ({listed})"
         between = f"take photos from places between {' and '.join(weakest_link(names, pairs))}"
         advice = f"If they show two scenes, keep one group in the folder; if they show one, {between}"
-    return f"no cameras: {reason}.\n{advice}. {FEWER}.\n{table(names, pairs)}"
+    return f"{reason}.\n{advice}. {FEWER}.\n{table(names, pairs)}"
 
 
 def went_forward(geometries: Mapping[tuple[str, str], PairGeometry]) -> bool:

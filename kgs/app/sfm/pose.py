@@ -148,7 +148,7 @@ def _pose_video(video: Path, out: Path, frames: int | None, options: dict[str, A
             return pose_photos(folder, out, **options)
         except DataError as error:
             path = video if Path(error.path) == folder else error.path
-            raise type(error)(path, error.field, error.reason) from error
+            raise type(error)(path, error.key, error.expected, error.got, advice=error.advice) from error
 
 
 def find_cameras(

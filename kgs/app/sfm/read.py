@@ -190,7 +190,7 @@ def _open(path: Path, mask: Mask | None) -> OpenPhoto:
     image = ImageFile(path)
     data = image.load()
     if data[4:8] == b"ftyp" and not (image_file.is_heic(data) and folders.has_heic()):
-        raise DataError(path, "", f"is a HEIC photo or a video under another name. {CONVERT}")
+        raise DataError(path, "", "a photo", "a HEIC photo or a video under another name", advice=CONVERT)
     exif = Exif.of(image.metadata.tags)
     width, height = image.size
     size = (height, width) if exif.is_sideways else (width, height)
@@ -340,14 +340,14 @@ def unlike_others(photos: list[OpenPhoto]) -> dict[str, str]:
     panoramas = [photo.path for photo in photos if photo.is_panorama]
     if 2 * len(panoramas) > len(photos):
         line = f'ffmpeg -i "{panoramas[0].name}" -vf v360=e:rectilinear:h_fov=90:v_fov=67:yaw=0 yaw_0.jpg'
-        reason = f"is a panorama, not a picture of a lens. Cut some from it: `{line}`, the same for other angles"
-        raise PhotosRefused(panoramas[0], "", reason)
+        advice = f"cut some from it: `{line}`, the same for other angles"
+        raise PhotosRefused(panoramas[0], "", "a picture of a lens", "a panorama", advice=advice)
     first = {photo.sha256: photo for photo in reversed(photos)}
     copies = [photo for photo in photos if photo is not first[photo.sha256]]
     if copies and len(first) < MIN_PHOTOS:
         advice = "two copies show no depth. Remove one, and take another photo from a step to the side"
-        reason = f"is the same photo as {first[copies[0].sha256].name}: {advice}"
-        raise PhotosRefused(copies[0].path, "", reason)
+        expected = f"another photo than {first[copies[0].sha256].name}"
+        raise PhotosRefused(copies[0].path, "", expected, "the same", advice=advice)
     shapes = by_shape([photo for photo in photos if photo is first[photo.sha256]])
     usual = max(shapes, key=lambda shape: len(shapes[shape]))
     others = {
@@ -359,8 +359,9 @@ def unlike_others(photos: list[OpenPhoto]) -> dict[str, str]:
     counts = sorted(map(len, shapes.values()), reverse=True)
     if others and (counts[0] < MIN_PHOTOS or counts[0] == counts[1]):
         groups = "; ".join(f"{shape}: {listed_files([p.path for p in group])}" for shape, group in shapes.items())
-        reason = f"expected photos of one shape, got {len(shapes)} ({groups}). Keep one group in the folder"
-        raise PhotosRefused(photos[0].path.parent, "", f"{reason}. Cropped photos do not fit those that are whole")
+        advice = "keep one group in the folder. Cropped photos do not fit those that are whole"
+        folder = photos[0].path.parent
+        raise PhotosRefused(folder, "", "photos of one shape", f"{len(shapes)} ({groups})", advice=advice)
     return {photo.name: f"it is the same photo as {first[photo.sha256].name}" for photo in copies} | others
 
 
