@@ -151,7 +151,7 @@ def say_left_out(rejected: Mapping[str, str], say: Callable[[str], None]) -> Non
 
 @dataclass(frozen=True)
 class Consensus:
-    """Two solvers of the same photos; the second one works in the executor's only thread."""
+    """Two solvers of the same photos, at work at the same time: the second one in the executor's only thread."""
 
     solvers: tuple[Solver, Solver]
     second_matches: "Future[None]"
@@ -160,7 +160,7 @@ class Consensus:
     pairs: Pairs
 
     def solve(self, names: Mapping[str, str]) -> tuple[Solutions, list[float]]:
-        """What each solver finds, and the focal lengths of the Exif if the photos do not tell them, else [].
+        """What each solver finds, and the focal lengths of the Exif where only these tell them, else [].
 
         Args:
             names: those of the photos to register, by those of their images.
@@ -273,7 +273,7 @@ def without_cameras(solutions: Solutions, names: Sequence[str], pairs: Pairs) ->
 
 
 def disputed_end(solutions: Solutions, names: Sequence[str], pairs: Pairs) -> dict[str, str]:
-    """The end of a chain of photos if solvers that registered all differ most about it, and by how much; else none.
+    """The end of a chain of photos, where solvers that registered all differ most about it, and by how much.
 
     It is the photo whose most matches with another one are fewest.
     """
@@ -293,7 +293,7 @@ def doubtful(solutions: Solutions, names: Sequence[str], pairs: Pairs) -> set[st
 
 
 def _registered_badly(first: Cameras, second: Cameras, names: Sequence[str], pairs: Pairs) -> dict[str, str]:
-    """The photos that a solver did not register, that see few points, or whose lens is disputed, and why."""
+    """The photos that a solver failed to register, that see few points, or whose lens is disputed, and why."""
     left = dict[str, str]()
     registered = [name for name in names if name in first.points and name in second.points]
     better = max((first, second), key=lambda found: _worst_seen(found, registered))
@@ -318,9 +318,9 @@ def _worst_seen(cameras: Cameras, names: Sequence[str]) -> tuple[int, int]:
 
 
 def _disputed(first: Cameras, second: Cameras, names: Sequence[str]) -> dict[str, str]:
-    """The photos without which both solvers agree about all pairs: at each turn that in most pairs they differ about.
+    """The photos about which solvers differ, one after the other: each time the one that most pairs are disputed with.
 
-    Fewer than three may be left.
+    About all pairs of the others they agree. Fewer than three of these may be left.
     """
     angles = {pair: angle_between(first, second, pair) for pair in combinations(names, 2)}
     left = dict[str, str]()
@@ -395,7 +395,7 @@ def check(
 
 
 def objections(cameras: Cameras, names: Sequence[str], longest: int) -> list[str]:
-    """The reasons to refuse one solver's cameras, a sentence each; empty if there are none."""
+    """The reasons to refuse one solver's cameras, a sentence each."""
     if not cameras.points:
         return ["no pair of photos gave a first guess of the cameras"]
     reasons = []
@@ -412,7 +412,7 @@ def objections(cameras: Cameras, names: Sequence[str], longest: int) -> list[str
 
 
 def focal_doubt(solutions: Sequence[Cameras]) -> str:
-    """Why neither solution determines the focal length; "" if one does."""
+    """Why the focal length is in doubt after all solutions, or ""."""
     rise = max(0.0, *(cameras.focal_rise for cameras in solutions))
     if rise >= MIN_RISE:
         return ""
@@ -420,7 +420,7 @@ def focal_doubt(solutions: Sequence[Cameras]) -> str:
 
 
 def focal_difference(solutions: Sequence[Cameras]) -> str:
-    """How far the solvers' focal lengths are apart, if that is too far; "" if it is not. Each lens counts."""
+    """How far the solvers' focal lengths are apart, if that is too far for one of the lenses, or ""."""
     registered = set[str].intersection(*(set(cameras.focals) for cameras in solutions))
     focals = [[cameras.focal for cameras in solutions]]
     focals += [[cameras.focals[name] for cameras in solutions] for name in registered]
