@@ -14,7 +14,6 @@ from kgs.app.sfm.accept import (
     Consensus,
     angle_between,
     check,
-    disputed_end,
     doubtful,
     objections,
     retry,
@@ -143,27 +142,6 @@ def test_photos_without_cameras_that_can_be_trusted(first, second, left, said):
     found = without_cameras((first, second), list(ALL), CHAIN)
     assert "".join(sorted(found)) == left
     assert all(said in why for why in found.values())
-
-
-TURNED = cameras(turned={name: 10.0 * i for i, name in enumerate(ALL)})
-
-
-@pytest.mark.parametrize(
-    ("second", "pairs", "end"),
-    [
-        (TURNED, CHAIN | {("e", "f"): 90}, "f"),
-        (TURNED, CHAIN | {("a", "b"): 90}, "a"),
-        (TURNED, CHAIN | {("c", "d"): 90, ("a", "f"): 300}, ""),
-        (cameras(turned={"b": 40.0, "c": -40.0}), CHAIN | {("e", "f"): 90}, ""),  # they differ most about others
-        (cameras(turned={"f": 1.0}), CHAIN | {("e", "f"): 90}, ""),
-        (cameras("abcde"), CHAIN | {("e", "f"): 90}, ""),  # a photo that was not registered is another matter
-        (NO_CAMERAS, CHAIN, ""),
-    ],
-)
-def test_the_end_of_a_chain_about_which_solvers_differ_most(second, pairs, end):
-    found = disputed_end((cameras(), second), list(ALL), pairs)
-    assert "".join(found) == end
-    assert all("degrees apart about it, the end of a chain" in why for why in found.values())
 
 
 @pytest.mark.parametrize(("second", "expected"), [(cameras("abc"), ""), (cameras("ab"), "c"), (NO_CAMERAS, "abc")])

@@ -29,7 +29,6 @@ from .pairs import (
     FEWER,
     MIN_MATCHES,
     Pairs,
-    count,
     gap,
     pair_geometry,
     table,
@@ -130,12 +129,6 @@ def accepted_cameras(
             rejected |= more
             kept = {image: name for image, name in kept.items() if name not in rejected}
             solutions, held = consensus.solve(kept)
-        if end := disputed_end(solutions, list(kept.values()), pairs):
-            shorter = {image: name for image, name in kept.items() if name not in end}
-            without, held_without = consensus.solve(shorter)
-            if not doubtful(without, list(shorter.values()), pairs):
-                kept, solutions, held = shorter, without, held_without
-                rejected |= end
         lap("cameras")
     say_left_out(rejected, say)
     forward = went_forward(geometries)
@@ -270,20 +263,6 @@ def without_cameras(solutions: Solutions, names: Sequence[str], pairs: Pairs) ->
     # without photos that were registered badly the solvers may agree about the others
     left = _registered_badly(*solutions, names, pairs) or _disputed(*solutions, names)
     return left if len(names) - len(left) >= MIN_PHOTOS else {}
-
-
-def disputed_end(solutions: Solutions, names: Sequence[str], pairs: Pairs) -> dict[str, str]:
-    """The end of a chain of photos, where solvers that registered all differ most about it, and by how much.
-
-    It is the photo whose most matches with another one are fewest.
-    """
-    if len(names) <= MIN_PHOTOS or _registered_badly(*solutions, names, pairs):
-        return {}
-    degrees, pair = largest_difference(*solutions, names)
-    end = min(names, key=lambda name: max(count(pairs, name, other) for other in names if other != name))
-    if degrees <= MAX_DEGREES or end not in pair:
-        return {}
-    return {end: f"two solvers are {degrees:.3g} degrees apart about it, the end of a chain of photos"}
 
 
 def doubtful(solutions: Solutions, names: Sequence[str], pairs: Pairs) -> set[str]:
