@@ -73,9 +73,13 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
     """Render N Gaussians in C cameras; a drop-in for `gsplat.rasterization` of gsplat 1.6, and of 1.5 by name.
 
     Differentiable in all tensors, `viewmats` and `Ks` included. For near_plane, radius_clip, eps2d, alpha_threshold,
-    transmittance_stop and max_bytes see :class:`kgs.RasterOptions`. tile_size, segmented, macro_tile, channel_chunk,
-    ut_params and renderer_config change nothing. What is left out below is accepted only at gsplat's defaults: the page
-    "Coming from gsplat" has the differences, argument by argument.
+    transmittance_stop and max_bytes see :class:`kgs.RasterOptions`.
+
+    tile_size, segmented, macro_tile, channel_chunk, ut_params and renderer_config change nothing. sparse_grad,
+    distributed, with_ut, with_eval3d, return_normals, global_z_order, rays, radial_coeffs, tangential_coeffs,
+    thin_prism_coeffs, ftheta_coeffs, lidar_coeffs, external_distortion_coeffs, rolling_shutter, viewmats_rs,
+    extra_signals and extra_signals_sh_degree are accepted only at gsplat's defaults. The page "Coming from gsplat" has
+    the reasons, and the differences argument by argument.
 
     Convention:
         World-to-camera matrices, OpenCV axes; quaternions w, x, y, z; the first pixel's centre at (0.5, 0.5).
