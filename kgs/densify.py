@@ -15,7 +15,7 @@ from torch.autograd.graph import increment_version
 
 from kgs._support.errors import ArgumentError
 
-from .backends import optimizer_stages
+from .backends import Backend, get_backend
 from .covariance import rotation_matrices
 from .model import GaussianModel
 from .types import ProjectedGaussians, check_kind
@@ -64,10 +64,10 @@ class Densifier:
 
     Args:
         model: the Gaussians.
-        optimizer: ONE optimizer that holds each of the model's parameters (gsplat's dict of optimizers becomes one Adam
-            with a group for each); other parameters in it stay as they are. Its state for a
-            parameter consists of scalars and of tensors of that parameter's shape which start at 0: Adam, SGD,
-            RMSprop; not LBFGS or Adafactor.
+        optimizer: ONE optimizer that holds each of :meth:`GaussianModel.per_gaussian` (gsplat's dict of optimizers
+            becomes one Adam with a group for each); other parameters of model and optimizer stay as they are. Its
+            state for a parameter consists of scalars and of tensors of that parameter's shape which start at 0: Adam,
+            SGD, RMSprop; not LBFGS or Adafactor.
         extent: size of the camera rig in world units, > 0, see :func:`camera_extent`.
         grad_threshold: mean gradient from which a Gaussian is cloned or split, >= 0.
         absgrad: take the absolute gradients that renders with `RasterOptions.absgrad` leave; they are about four times
@@ -105,7 +105,7 @@ class Densifier:
         prune_opacity: float = 0.005,
         max_gaussians: int | None = None,
         generator: torch.Generator | None = None,
-        backend: str = "torch",
+        backend: str | Backend = "torch",
     ) -> None:
         check_kind("model", model, GaussianModel)
         maximum = 1 if max_gaussians is None else max_gaussians
@@ -117,11 +117,11 @@ class Densifier:
             ("max_gaussians", max_gaussians, maximum >= 1 and maximum % 1 == 0, "an integer >= 1 or None"),
         ):
             if not fits:
-                raise ArgumentError(f"{name}: expected {expected}, got {number}")
+                raise ArgumentError(name, expected, number)
         if not hasattr(optimizer, "param_groups"):
             raise TypeError(f"optimizer: expected one torch.optim.Optimizer, got {type(optimizer).__name__}")
         if isinstance(optimizer, _UNSUPPORTED_OPTIMIZERS):
-            raise ArgumentError(f"optimizer: expected Adam, SGD or the like, got {type(optimizer).__name__}")
+            raise ArgumentError("optimizer", "Adam, SGD or the like", type(optimizer).__name__)
         self.model = model
         self.optimizer = optimizer
         self.extent = float(extent)
@@ -131,7 +131,7 @@ class Densifier:
         self.prune_opacity = prune_opacity
         self.max_gaussians = max_gaussians
         self.generator = torch.Generator().manual_seed(0) if generator is None else generator
-        self._stages = optimizer_stages(backend, model.means)
+        self._backend = get_backend(backend, model.means.device).covering("optimizer", model.means)
         self._restart_statistics(torch.zeros_like(self.model.means[:, 0]))
         self._check()
 
@@ -149,6 +149,7 @@ class Densifier:
         `absgrad` there is nothing to retain.
 
         Raises:
+            TypeError: `projected` is something else, as a whole `Rendering`.
             ValueError: `projected.means2d` has no gradient, or the number of Gaussians differs from the model's.
 
         Examples:
@@ -164,11 +165,12 @@ class Densifier:
             >>> densifier.observe(out.projected)
             >>> optimizer.step()
         """
+        check_kind("projected", projected, ProjectedGaussians)
         self._check_count()
         count = projected.num_gaussians
         expected = len(self.model)
         if count != expected:
-            raise ArgumentError(f"projected: expected a render of the model's {expected} Gaussians, got one of {count}")
+            raise ArgumentError("projected", f"a render of the model's {expected} Gaussians", f"one of {count}")
         if len(projected) == 0:
             return
         gradient = self._gradient_of(projected.means2d)
@@ -176,8 +178,8 @@ class Densifier:
         ids = projected.gaussian_ids
         sums = self._statistics["gradient_sums"]
         counts = self._statistics["counts"]
-        if self._stages is not None and projected.num_cameras == 1:
-            self._stages.add_gradient_norms(sums, counts, ids, gradient, (width / 2, height / 2))
+        if self._backend.add_gradient_norms is not None and projected.num_cameras == 1:
+            self._backend.add_gradient_norms(sums, counts, ids, gradient, (width / 2, height / 2))
             return
         norms = torch.hypot(gradient[:, 0] * (width / 2), gradient[:, 1] * (height / 2)) * projected.num_cameras
         sums.index_add_(0, ids, norms)
@@ -206,10 +208,10 @@ class Densifier:
         split = (over & large).nonzero()[:, 0]
         unchanged = (opaque & ~(over & large)).nonzero()[:, 0]
         added = torch.cat([cloned, split.repeat(CHILDREN)])
-        new = {name: parameter.index_select(0, added) for name, parameter in model.named_parameters()}
+        new = {name: parameter.index_select(0, added) for name, parameter in model.per_gaussian().items()}
         new["means"][len(cloned) :] += self._sample_offsets(split.repeat(CHILDREN))
         new["log_scales"][len(cloned) :] -= math.log(SHRINK)
-        for name, parameter in list(model.named_parameters()):
+        for name, parameter in model.per_gaussian().items():
             self._replace(name, torch.cat([parameter.index_select(0, unchanged), new[name]]), unchanged)
         self._restart_statistics(self.mean_gradients[torch.cat([unchanged, added])])
         return DensifyReport(
@@ -224,7 +226,7 @@ class Densifier:
     def reset_opacity(self, ceiling: float = 0.01) -> None:
         """Lower all opacities to at most `ceiling`, in (0, 1) (else a ValueError), and zero their moments."""
         if not 0.0 < ceiling < 1.0:
-            raise ArgumentError(f"ceiling: expected a number in (0, 1), got {ceiling}")
+            raise ArgumentError("ceiling", "a number in (0, 1)", ceiling)
         self._check()
         lowered = self.model.opacity_logits.clamp(max=math.log(ceiling / (1.0 - ceiling)))
         no_rows = torch.empty(0, dtype=torch.int64, device=lowered.device)
@@ -237,10 +239,10 @@ class Densifier:
         `rows`, bool `(N,)`, are the Gaussians whose opacities are meant; None: all.
         """
         if not 0.0 < factor < 1.0:
-            raise ArgumentError(f"factor: expected a number in (0, 1), got {factor}")
+            raise ArgumentError("factor", "a number in (0, 1)", factor)
         logits = self.model.opacity_logits
-        if self._stages is not None and rows is None and logits.is_contiguous():
-            self._stages.decay_opacity(logits, factor)
+        if self._backend.decay_opacity is not None and rows is None and logits.is_contiguous():
+            self._backend.decay_opacity(logits, factor)
             increment_version(logits)
             return
         # of f s(x): log f - log(e^-x + 1 - f)
@@ -256,10 +258,10 @@ class Densifier:
         shape = (len(self.model),)
         missing = {*self._statistics, "generator"} - state.keys()
         if missing:
-            raise ArgumentError(f"state: expected the entries of state_dict, got none for {sorted(missing)}")
+            raise ArgumentError("state", "the entries of state_dict", f"none for {sorted(missing)}")
         for name in self._statistics:
             if state[name].shape != shape:
-                raise ArgumentError(f"{name}: expected shape {shape}, got {tuple(state[name].shape)}")
+                raise ArgumentError(name, f"shape {shape}", tuple(state[name].shape))
         self._restart_statistics(self.model.means.new_zeros(shape))
         for name, value in self._statistics.items():
             value.copy_(state[name])
@@ -269,14 +271,14 @@ class Densifier:
         """The gradients that the last backward pass stored in projected centres, `(M, 2)`."""
         if not means2d.requires_grad:
             why = "the means need requires_grad=True, and the render has to be made with gradients on"
-            raise ArgumentError(f"projected: expected means2d that require a gradient: {why}")
+            raise ArgumentError("projected", "means2d that require a gradient", advice=why)
         name = "absgrad" if self.absgrad else "grad"
         is_kept = self.absgrad or means2d.is_leaf or means2d.retains_grad  # torch warns where .grad is not kept
         gradient: Tensor | None = getattr(means2d, name, None) if is_kept else None
         if gradient is None:
             order = "and observe comes after backward"
             why = "the render needs absgrad=True" if self.absgrad else "means2d.retain_grad() comes after the render"
-            raise ArgumentError(f"projected: expected means2d.{name}, got None: {why}, {order}")
+            raise ArgumentError("projected", f"means2d.{name}", "None", advice=f"{why}, {order}")
         return gradient
 
     def _check_count(self) -> None:
@@ -284,24 +286,20 @@ class Densifier:
         count = len(self.model)
         expected = len(self._statistics["counts"])
         if count != expected:
-            raise ArgumentError(f"model: expected {expected} Gaussians, got {count}; load the densifier's state too")
+            raise ArgumentError("model", f"{expected} Gaussians", count, advice="load the densifier's state too")
 
     def _check(self) -> None:
         """Raise a ValueError if the model, its statistics and the optimizer's state do not belong together."""
         self._check_count()
         held = {id(parameter) for group in self.optimizer.param_groups for parameter in group["params"]}
-        for name, parameter in self.model.named_parameters():
+        for name, parameter in self.model.per_gaussian().items():
             if id(parameter) not in held:
-                raise ArgumentError(
-                    f"optimizer: expected it to hold all of the model's parameters, got none for {name}"
-                )
+                raise ArgumentError("optimizer", "it to hold all of the model's parameters", f"none for {name}")
             shape = tuple(parameter.shape)
             for key, entry in self.optimizer.state.get(parameter, {}).items():
                 if isinstance(entry, Tensor) and entry.numel() != 1 and entry.shape != shape:
                     got = tuple(entry.shape)
-                    raise ArgumentError(
-                        f"optimizer: expected the state {key} of {name} to have shape {shape}, got {got}"
-                    )
+                    raise ArgumentError("optimizer", f"the state {key} of {name} to have shape {shape}", got)
 
     def _sample_offsets(self, ids: Tensor) -> Tensor:
         """Draw an offset from the centre for each id, from that Gaussian's own distribution."""

@@ -42,7 +42,7 @@ def camera_extent(extrinsics: Tensor) -> float:
     """
     check_tensor("extrinsics", extrinsics)
     if extrinsics.ndim != 3 or extrinsics.shape[-2:] != (4, 4) or len(extrinsics) == 0:
-        raise ArgumentError(f"extrinsics: expected shape (C, 4, 4) with C >= 1, got {tuple(extrinsics.shape)}")
+        raise ArgumentError("extrinsics", "shape (C, 4, 4) with C >= 1", tuple(extrinsics.shape))
     centres = camera_centers(extrinsics)
     return 1.1 * float((centres - centres.mean(dim=0)).norm(dim=1).max())
 
@@ -210,12 +210,12 @@ def log_spacing(points: Tensor) -> Tensor:
         points: `(N, 3)`, N >= 4, finite, not all in one place; else a ValueError.
     """
     if len(points) <= NEIGHBOURS:
-        raise ArgumentError(f"points: expected at least {NEIGHBOURS + 1} to take a spacing from, got {len(points)}")
+        raise ArgumentError("points", f"at least {NEIGHBOURS + 1} to take a spacing from", len(points))
     points = points.double()
     centred = points - points.mean(dim=0)
     size = centred.abs().amax()
     if not 0.0 < float(size) < math.inf:
-        raise ArgumentError(f"points: expected points in different places, got a cloud of half size {float(size):g}")
+        raise ArgumentError("points", "points in different places", f"a cloud of half size {float(size):g}")
     centred = centred / size  # float32 then suffices to find the neighbours, whatever the cloud's unit and position
     centred = centred.masked_fill(centred.abs() < 1e-100, 0.0)  # its square would be 0
     squared = _mean_squared_distance(centred)

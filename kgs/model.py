@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from kgs._support.errors import ArgumentError
+from kgs._support.errors import ArgumentError, quoted
 
-from .backends import choose
+from .backends import Backend, get_backend
 from .geometry import log_spacing
 from .harmonics import SH_C0
 from .types import SH_SIZES, Gaussians, check_tensor
@@ -111,10 +111,10 @@ class GaussianModel(nn.Module):
             raise TypeError(f"colors: expected floating point values, got {colors.dtype}")
         if points.ndim != 2 or points.shape[1] != 3 or colors.shape != points.shape:
             shapes = f"{tuple(points.shape)} and {tuple(colors.shape)}"
-            raise ArgumentError(f"points, colors: expected two of shape (N, 3), got {shapes}")
+            raise ArgumentError("points, colors", "two of shape (N, 3)", shapes)
         for name, value in (("points", points), ("colors", colors)):
             if not bool(value.isfinite().all()):
-                raise ArgumentError(f"{name}: expected finite numbers, got NaN or infinity")
+                raise ArgumentError(name, "finite numbers", "NaN or infinity")
         _check_degree(sh_degree, MAX_SH_DEGREE)
         points = points.detach()
         n = len(points)
@@ -127,13 +127,17 @@ class GaussianModel(nn.Module):
             sh_rest=points.new_zeros(n, SH_SIZES[sh_degree] - 1, 3),
         )
 
+    def per_gaussian(self) -> dict[str, nn.Parameter]:
+        """The parameters with a row for each Gaussian, by name: those of the class, and none that was added to it."""
+        return {name: self.get_parameter(name) for name in PARAMETERS}
+
     def select(self, rows: Tensor, sh_degree: int | None = None) -> "GaussianModel":
         """A new model of the Gaussians at `rows`: a mask `(N,)` or indices `(M,)`.
 
         `sh_degree` is the highest degree of the harmonics that are kept; None keeps all.
         """
         degree = self.max_sh_degree if sh_degree is None else _check_degree(sh_degree, self.max_sh_degree)
-        values = {name: parameter.detach()[rows] for name, parameter in self.named_parameters()}
+        values = {name: parameter.detach()[rows] for name, parameter in self.per_gaussian().items()}
         values["sh_rest"] = values["sh_rest"][:, : SH_SIZES[degree] - 1]
         return GaussianModel(**values, sh_degree=min(degree, self.sh_degree), antialiased=self.antialiased)
 
@@ -151,7 +155,7 @@ class GaussianModel(nn.Module):
     def sh_degree(self, value: int) -> None:
         self._sh_degree = _check_degree(value, self.max_sh_degree)
 
-    def forward(self, *, backend: str = "auto") -> Gaussians:
+    def forward(self, *, backend: str | Backend = "auto") -> Gaussians:
         """The Gaussians: activated scales and opacities, and harmonics up to the active degree.
 
         A Gaussian whose scale overflows has an infinite one, without gradient, and is not rendered.
@@ -160,10 +164,11 @@ class GaussianModel(nn.Module):
             backend: "auto", or the name of one, see `kgs.backends`. By "triton" differentiable once.
 
         Raises:
+            TypeError: the model is neither of float32 nor of float64.
             ValueError: the backend does not exist, or does not cover a model of this dtype or device.
             ModuleNotFoundError: the backend is numba or triton, and it is not installed.
         """
-        chosen = choose(backend, "activation", self.means.device, lambda candidate: candidate.covers(self.means))
+        chosen = get_backend(backend, self.means.device).covering("activation", self.means)
         # at degree 0 sh_rest gets no gradient, and an optimiser skips it
         parameters = (self.log_scales, self.opacity_logits, self.sh_dc, self.sh_rest)
         scales, opacities, colors = chosen.activate(*parameters, SH_SIZES[self.sh_degree])
@@ -207,7 +212,7 @@ class GaussianModel(nn.Module):
 def _check_degree(value: int, highest: int) -> int:
     """The degree as an int; a ValueError if it is not one from 0 to the highest."""
     if not isinstance(value, int | np.integer) or not 0 <= value <= highest:
-        raise ArgumentError(f"sh_degree: expected an integer from 0 to {highest}, got {value!r}")
+        raise ArgumentError("sh_degree", f"an integer from 0 to {highest}", quoted(value))
     return int(value)
 
 
@@ -218,9 +223,9 @@ def _check_shapes(values: Sequence[Tensor]) -> int:
     n = means.shape[0] if means.ndim else 0
     k = sh_rest.shape[1] + 1 if sh_rest.ndim == 3 else 0
     if k not in SH_SIZES:
-        raise ArgumentError(f"sh_rest: expected shape ({n}, K - 1, 3) with K in {SH_SIZES}, got {tuple(sh_rest.shape)}")
+        raise ArgumentError("sh_rest", f"shape ({n}, K - 1, 3) with K in {SH_SIZES}", tuple(sh_rest.shape))
     shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, 1, 3), (n, k - 1, 3))
     for name, value, shape in zip(PARAMETERS, values, shapes, strict=True):
         if tuple(value.shape) != shape:
-            raise ArgumentError(f"{name}: expected shape {shape}, got {tuple(value.shape)}")
+            raise ArgumentError(name, f"shape {shape}", tuple(value.shape))
     return SH_SIZES.index(k)

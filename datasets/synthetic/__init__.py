@@ -51,7 +51,7 @@ def synthetic_scene(
         ("seed", seed, 0),
     ):
         if value < minimum:
-            raise ArgumentError(f"{name}: expected at least {minimum}, got {value}")
+            raise ArgumentError(name, f"at least {minimum}", value)
     world = _make_world(seed)
     train_eyes, test_eyes = _patch_eyes(train_views, test_views, np.random.default_rng([seed, 1]))
     with torch.device("cpu"):  # whatever torch's default is
@@ -78,7 +78,7 @@ def views_beyond(out: float, count: int = 6, size: tuple[int, int] = (126, 168),
         ValueError: a number is out of range.
     """
     if not 0.0 < out < np.inf or count < 1:
-        raise ArgumentError(f"out, count: expected a number > 0 and at least one camera, got {out} and {count}")
+        raise ArgumentError("out, count", "a number > 0 and at least one camera", f"{out} and {count}")
     return _views(_make_world(seed), room.EYE + out * _ellipse(count) * room.PATCH, size, "beyond")
 
 
@@ -100,7 +100,7 @@ def synthetic_depths(cameras: PinholeCamera, seed: int = 0) -> Tensor:
     """
     sizes = set(zip(cameras.height.int().tolist(), cameras.width.int().tolist(), strict=True))
     if len(sizes) != 1:
-        raise ArgumentError(f"cameras: expected one image size, got {sorted(sizes)}")
+        raise ArgumentError("cameras", "one image size", sorted(sizes))
     size = sizes.pop()
     triangles = _make_world(seed).triangles
     matrices = zip(cameras.intrinsics.double().cpu(), cameras.extrinsics.double().cpu(), strict=True)

@@ -23,8 +23,8 @@ from photo_folders import (
     write_planes,
 )
 
-from kgs.app.sfm import map as mapping
 from kgs.app.sfm import pose_photos
+from kgs.app.sfm.map import Solver
 from kgs.app.sfm.write import leveling, write_model
 from kgs.datasets import load_scene
 from kgs.errors import PhotosRefused
@@ -153,7 +153,6 @@ def test_the_report_says_what_was_found(posed):
     assert sorted(path.name for path in out.iterdir()) == [
         ".kgs.json",
         ".kgs.lock",
-        ".lock",
         "images",
         "photos.json",
         "sparse",
@@ -177,7 +176,7 @@ def test_the_same_photos_and_seed_give_the_same_files(posed, tmp_path):
 
 def test_a_second_run_uses_what_is_there(posed):
     folder, out, _, _ = posed
-    lines, before = [], {path: path.stat().st_mtime_ns for path in out.rglob("*.*") if path.name != ".lock"}
+    lines, before = [], {path: path.stat().st_mtime_ns for path in out.rglob("*.*") if path.name != ".kgs.lock"}
     assert pose_photos(folder, out, say=lines.append)["reused"]
     assert "used again" in lines[0]
     assert {path: path.stat().st_mtime_ns for path in before} == before
@@ -269,13 +268,13 @@ def test_a_zoomed_photo_gets_a_lens_of_its_own(tmp_path):
 
 
 def test_a_solver_whose_first_pair_leads_nowhere_registers_all_photos(tmp_path, monkeypatch):
-    map_once = mapping._run_mapper
+    map_once = Solver._run_mapper
 
-    def run_mapper(pycolmap, database, images, work, options, start=""):
-        fails = database.stem == "second" and options.init_image_id1 < 0
-        return None if fails else map_once(pycolmap, database, images, work, options, start)
+    def run_mapper(solver, options, start=""):
+        fails = solver.database.stem == "second" and options.init_image_id1 < 0
+        return None if fails else map_once(solver, options, start)
 
-    monkeypatch.setattr(mapping, "_run_mapper", run_mapper)
+    monkeypatch.setattr(Solver, "_run_mapper", run_mapper)
     report = pose_photos(write_planes(tmp_path / "photos", small_planes()), tmp_path / "out")
     assert len(report["photos"]) == 3
     assert report["left_out"] == {}
@@ -288,6 +287,13 @@ def test_photos_that_are_close_together_take_the_focal_length_of_their_exif(tmp_
     assert report["focal_px"] == report["exif_focal_px"] == pytest.approx(30 * WIDTH / 34.6, rel=1e-3)
     assert report["focal_rise"] is None
     assert any("the Exif says 208 pixels" in line for line in lines)
+
+
+def test_photos_whose_exif_has_a_focal_length_that_no_lens_has(tmp_path):
+    lines, folder = [], write_photos(tmp_path / "photos", small_planes(), [28, 1, 1])
+    report = pose_photos(folder, tmp_path / "out", say=lines.append)
+    assert len(report["photos"]) == 3
+    assert any("no lens has" in line and line.endswith("IMG_2.jpg, IMG_3.jpg") for line in lines)
 
 
 @pytest.mark.slow
@@ -331,7 +337,7 @@ def test_real_photos_against_given_poses(tmp_path, kgs_data, name, views, rotati
     for view in given.names:
         shutil.copy(folder / Path(view).name, tmp_path / "photos")
     if rotation is None:
-        with pytest.raises(PhotosRefused, match="no cameras that can be trusted"):
+        with pytest.raises(PhotosRefused, match="cameras can be trusted"):
             pose_photos(tmp_path / "photos", tmp_path / "out")
         return
     pose_photos(tmp_path / "photos", tmp_path / "out")

@@ -12,6 +12,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import PIL.Image
 import pytest
 from tiny_scenes import update_json, write_blender, write_colmap, write_llff, write_nerfstudio
 
@@ -104,13 +105,20 @@ def gone(path: Path) -> None:
     path.with_name("2.png").unlink()
 
 
+def sideways(path: Path) -> None:
+    """As a phone stores an upright photo, its size in the scene's file being that of the upright one."""
+    exif = PIL.Image.Exif()
+    exif[0x112] = 6
+    PIL.Image.new("RGB", (12, 16)).save(path, exif=exif)
+
+
 POSES = "poses_bounds.npy"
 LLFF = [
     *[
         (POSES, array(change), f"{POSES}: expected floating")
         for change in (lambda rows: rows[:, :16], lambda rows: rows[0], lambda rows: rows.astype(np.int64))
     ],
-    (POSES, array(lambda rows: rows[:2]), f"{POSES}: has 2 poses, but images/ has 3"),
+    (POSES, array(lambda rows: rows[:2]), f"{POSES}: expected 3 poses"),
     *[(POSES, row(*cell), f"{POSES}: row 1") for cell in ((2, np.nan), (4, 12.5), (4, 0))],
     (POSES, row(14, -80), f"{POSES}: 1.png"),
     (POSES, row(0, 0.7), f"{POSES}: 1.png"),
@@ -121,7 +129,7 @@ LLFF = [
     ],
     (POSES, npy("(1, 17)", "|O"), f"{POSES}: "),
     (POSES, content(b"PK\x03\x04 no zip"), f"{POSES}: "),
-    ("masks/9.png", picture(12, 16), "masks/9.png: "),
+    ("masks/9.png", picture(12, 16), "masks: "),
     ("masks/0.png", picture(12, 10), "masks/0.png: "),
     ("masks/0.png", picture(12, 16, black=True), "masks/0.png: "),
     ("masks/0.png", picture(12, 16, kept_bytes=40), "masks/0.png: "),
@@ -137,7 +145,7 @@ COLMAP = [
     (CAMERAS, text(" 14.0 14.5 ", " -14 14.5 "), f"{IMAGES}: 0.png"),
     (CAMERAS, text(" 14.0 14.5 ", " nan 14.5 "), f"{IMAGES}: 0.png"),
     (CAMERAS, text(" 0.001 -0.001", " 0.001 inf"), f"{IMAGES}: 0.png"),
-    (CAMERAS, text("\n1 ", "\n8 "), f"{IMAGES}: 0.png: has camera 1"),
+    (CAMERAS, text("\n1 ", "\n8 "), f"{IMAGES}: 0.png: expected a camera of cameras.txt, got 1"),
     (CAMERAS, text("\n1 ", "\n2 "), f"{CAMERAS}: camera 2"),
     (CAMERAS, content(b"\xe9"), f"{CAMERAS}: "),
     (IMAGES, text(" 1 2.png", " 1 ../2.png"), f"{IMAGES}: '../2.png'"),
@@ -167,10 +175,11 @@ COLMAP = [
     (RIGS, text(r"5 2 CAMERA 1 .*", "5 2 CAMERA 1 CAMERA 1 0"), f"{RIGS}: rig 5: camera 1"),
     (RIGS, text(r"CAMERA 2 1 \S+", "CAMERA 2 1 inf"), f"{RIGS}: rig 5"),
     ("images/1.png", picture(16, 12), "images/1.png: "),
-    ("images/1.png", gone, ": 2 of 3 images are missing: images/1.png, images/2.png"),
+    ("images/1.png", gone, ": expected 3 images, got 1: there is no images/1.png, images/2.png"),
 ]
 NERFSTUDIO_FILE = "transforms.json"
 TRAIN = "transforms_train.json"
+THIRD_POSE = "transform_matrix of ./train/2"
 UNUSABLE: list[tuple[str, Any]] = [
     ("k4", 0.1),  # nerfstudio: the fourth radial term; OpenCV: a denominator
     ("k6", -0.1),
@@ -227,10 +236,11 @@ NERFSTUDIO = [
         for said, where in [
             ({"camera_make": "Insta360", "camera_model": "EQUIRECTANGULAR"}, "camera_model"),
             ({"fl_x": 0}, "images/0.png"),
+            ({"fl_x": 0.9, "fl_y": 1.2, "cx": 0.5, "cy": 0.5}, "images/0.png"),  # shares of the sides
             ({"fl_x": None, "fl_y": None}, "fl_x"),
             ({"w": 16.5}, "w, h"),
             ({"w": 0}, "images/0.png"),
-            ({"k1": -4.0}, "images/2.png"),
+            ({"k1": -4.0}, "distortion of images/2.png"),
             ({"train_filenames": ["images/0.png"], "test_filenames": ["images/0.png"]}, "images/0.png"),
             ({"train_filenames": ["images/9.png"]}, "train_filenames"),
             ({"test_filenames": "images/0.png"}, "test_filenames"),
@@ -241,6 +251,7 @@ NERFSTUDIO = [
         ]
     ],
     (NERFSTUDIO_FILE, top(w=12, h=16), "images/1.png: "),
+    ("images/1.png", sideways, "images/1.png: expected a scaled version of the 16x12 that"),
     (NERFSTUDIO_FILE, frame(camera_model="OPENCV_FISHEYE", is_fisheye=False), f"{NERFSTUDIO_FILE}: is_fisheye of"),
     (NERFSTUDIO_FILE, frame(camera_model="OPENCV_FISHEYE", p1=0.01), f"{NERFSTUDIO_FILE}: p1 of images/2.png"),
 ]
@@ -253,9 +264,9 @@ BLENDER = [
     (TRAIN, frame(file_path="../../etc/passwd"), f"{TRAIN}: '../../etc/passwd'"),
     (TRAIN, frame(file_path=7), f"{TRAIN}: file_path"),
     (TRAIN, frame(file_path="train/1"), f"{TRAIN}: train/1.png"),
-    (TRAIN, frame(file_path="train/77"), ": 1 of 6 images are missing: train/77.png"),
+    (TRAIN, frame(file_path="train/77"), ": expected 6 images, got 5: there is no train/77.png"),
     *[
-        (TRAIN, change, f"{TRAIN}: transform_matrix of ./train/2")
+        (TRAIN, change, f"{TRAIN}: {THIRD_POSE}")
         for change in (
             frame(transform_matrix=[[1, 0], [0, 1]]),
             frame(transform_matrix=None),
@@ -264,7 +275,13 @@ BLENDER = [
             *not_finite("transform_matrix", lambda transform_matrix: pose(0, 3, value=transform_matrix)),
         )
     ],
-    (TRAIN, pose([0, 1, 2], [0, 1, 2], value=1.01), f"{TRAIN}: train/2.png"),
+    (
+        TRAIN,
+        pose([0, 1, 2], [0, 1, 2], value=1.01),
+        f"{TRAIN}: {THIRD_POSE}: expected a rotation, got one scaled by 1.01: ",
+    ),
+    (TRAIN, pose(0, 1, value=0.25), f"{TRAIN}: {THIRD_POSE}: expected a right-handed rotation, got [[1.0, 0.25, 0.0]"),
+    (TRAIN, pose(2, 2, value=-1.0), f"{TRAIN}: {THIRD_POSE}: expected a right-handed rotation"),
     *[(TRAIN, content(written.encode()), f"{TRAIN}: ") for written in NO_OBJECTS],
     (TRAIN, content(b"\xff"), f"{TRAIN}: "),
     ("masks/0.png", picture(12, 16), "masks/0.png: "),  # of which of two photos?
@@ -289,3 +306,4 @@ def test_the_error_names_the_file_and_what_in_it(
     with pytest.raises(DataError) as error:
         load_scene(tmp_path, points="model-points" if layout == "COLMAP" else "none")
     assert str(error.value).removeprefix(str(tmp_path)).removeprefix("/").startswith(said)
+    assert ("Exif" in str(error.value)) == (change is sideways)

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import pytest
 import torch
+from fits_in_folders import fit_in
 from kornia.geometry.liegroup import Se3
 from tiny_scenes import write_llff
 
 from kgs._support.errors import DataError
 from kgs.app.cli.evaluate import evaluate
-from kgs.app.files.results_folder import CHECKPOINT
-from kgs.app.fit_folder import fit_folder
+from kgs.app.files.fit_files import CHECKPOINT
 from kgs.app.saved_fit import load_fit
 from kgs.app.scene_request import SceneRequest
 from kgs.datasets import load_scene, synthetic_scene
@@ -123,7 +123,8 @@ def test_a_fit_turns_wrong_cameras_back():
     config = FitConfig(steps=150, seed=1, sh_degree=0, init_points=1500, max_gaussians=2000, evaluations=1)
     points = choose_points(wrong, config)
     fits = [
-        Trainer(wrong, make_plan(wrong, replace(config, refine_poses=moves)), points).fit() for moves in (False, True)
+        Trainer(wrong, make_plan(wrong, replace(config, refine_poses=moves), points), points).fit()
+        for moves in (False, True)
     ]
     fixed, moved = fits
     given, found = scene.train.cameras.extrinsics, moved.scene.train.cameras.extrinsics
@@ -140,7 +141,7 @@ def refined(tmp_path_factory):
     out = tmp_path_factory.mktemp("out")
     write_llff(root)
     request = SceneRequest(str(root))
-    fit_folder(request.load(out), CONFIG, out, request, say=lambda line: None)
+    fit_in(request.load(out), CONFIG, out, request, say=lambda line: None)
     return root, out
 
 
@@ -169,9 +170,9 @@ def test_poses_of_other_photos_are_refused(refined, tmp_path):
     values = load_checkpoint(out / CHECKPOINT)
     values["poses"]["extrinsics"] = values["poses"]["extrinsics"][1:]
     save_checkpoint(out / CHECKPOINT, values)
-    with pytest.raises(DataError, match="training views, but the fit has poses of") as error:
+    with pytest.raises(DataError, match="training views of the fit") as error:
         load_fit(out)
-    assert error.value.field == "train"
+    assert error.value.key == "train"
 
 
 def test_decayed():

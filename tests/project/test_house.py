@@ -162,9 +162,8 @@ print(kgs._support.machine.peak_rss_mb())
 
 # -- errors --------------------------------------------------------------------------------------------------------
 
-# two import nothing of kgs; the readers turn their ValueErrors into DataErrors
-PLAIN = {"kgs.drop", "kgs.reference"}
-PLAIN |= {"kgs._support.json_files", "kgs.datasets.color_profile", "kgs.datasets.image_file", "kgs.fit.checkpoint"}
+PLAIN = {"kgs.drop", "kgs.reference"}  # import nothing of kgs
+PLAIN |= {"kgs._support.json_files", "kgs.datasets.image_file"}  # whose readers turn them into DataErrors
 
 
 def test_a_wrong_value_is_an_argument_error():

@@ -1,84 +1,113 @@
 """Checks of options that need no torch: a command calls them first, because torch takes seconds to load."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from kgs._support.errors import ArgumentError, DataError
+from kgs._support.errors import ArgumentError, DataError, quoted
 from kgs.datasets.folders import has_photos
 from kgs.datasets.options import held_out_between_ends
 from kgs.datasets.source import SceneSource
 
+from .tools import check_installed
+
+if TYPE_CHECKING:
+    from kgs.app.sfm.source import Source
+
 SMALLEST = 32  # pixels of the longer side of a fit's photos
+_HEAD = 4096  # bytes, enough for the header of any splat
 
 
 def check_roll(roll: float) -> None:
     """Raise a ValueError unless this is an angle by which pictures can be turned."""
     if not -360 <= roll <= 360:
-        raise ArgumentError(f"roll: expected degrees in [-360, 360], got {roll}")
+        raise ArgumentError("roll", "degrees in [-360, 360]", roll)
 
 
 def check_side(size: int) -> None:
     """Raise a ValueError unless photos can be fitted with so many pixels on their longer side."""
     if size < SMALLEST:
-        raise ArgumentError(f"size: expected at least {SMALLEST} pixels, got {size}")
+        raise ArgumentError("size", f"at least {SMALLEST} pixels", size)
 
 
-def check_file(out: Path, ending: str, kind: str, source: Path | None = None) -> None:
+def check_file(out: Path, ending: str, source: Path | None = None) -> None:
     """Raise a ValueError or DataError unless a command can write its result to this file, which is not `source`.
 
-    `kind` is that of :func:`kgs.app.files.publishing.replacing`.
+    A file that is there is replaced if kgs wrote it, and if it is none of the results of a fit.
     """
-    from kgs.app.files.publishing import check_free
+    from kgs.app.files.results import read_marker
 
     if out.suffix.lower() != ending:
-        raise ArgumentError(f"out: expected a file that ends in {ending}, got {str(out)!r}")
+        raise ArgumentError("out", f"a file that ends in {ending}", quoted(out))
     if out.is_dir():
-        raise DataError(out, "", "expected a file, found a folder of this name")
+        raise DataError(out, "", "a file", "a folder of this name")
     if source is not None and out.exists() and out.samefile(source):
-        raise ArgumentError(f"out: expected another file than {str(source)!r}, which is read")
+        raise ArgumentError("out", f"another file than {str(source)!r}, which is read")
     if not out.absolute().parent.is_dir():
-        raise DataError(out, "", "no such folder to write it to")
-    check_free(out.parent, kind, [out.name])
+        raise DataError(out, "", "a folder to write it to", "none")
+    if out.exists() and not _is_of_kgs(out):
+        raise DataError(out, "", "a new file or one that kgs wrote", "another", advice="choose another name")
+    results = read_marker(out.parent)
+    if any(out.name in results.get(kind, []) for kind in ("fit", "scale")):
+        raise DataError(out, "", "a new file", "one of the results in this folder", advice="choose another name")
+
+
+def _is_of_kgs(path: Path) -> bool:
+    """Whether a file begins as the splats and pages that kgs writes."""
+    with path.open("rb") as file:
+        head = file.read(_HEAD)
+    is_splat = head.startswith(b"ply\n") and any(word in head for word in (b"\ncomment kgs ", b" packed_position\n"))
+    return is_splat or b'<meta name="generator" content="made by kgs ' in head
 
 
 def check_photos_of(source: SceneSource) -> None:
     """Raise a DataError unless a scene has at least one photo."""
     if not has_photos(source.root):
-        reason = "has camera poses but no photos: expected them in images/, or where its files say"
-        raise DataError(source.root, "", reason)
+        raise DataError(source.root, "", "photos in images/, or where its files say", "camera poses alone")
 
 
 def check_results(out: Path) -> None:
-    """Raise a DataError unless this is the folder of the results of a fit."""
-    from kgs._support.json_files import read_json
-    from kgs.app.files.locks import locked
-    from kgs.app.files.publishing import UNFINISHED, complete
-    from kgs.app.files.results_folder import has_fit
+    """Raise a DataError unless this is the folder of the results of a fit; end what a kill left of a move there."""
+    from kgs.app.files.fit_files import UNFINISHED, has_fit
+    from kgs.app.files.results import complete
 
     complete(out)
     config = out / "config.json"
     if not config.exists() and has_fit(out / UNFINISHED):
-        with locked(out):  # or it is at work
-            raise DataError(out, "", "holds a fit that is not done: kgs fit --resume goes on with it")
+        raise DataError(out, "", "a fit that is done", "one that is not", advice="kgs fit --resume goes on with it")
     if not config.exists():
-        raise DataError(config, "", "cannot be read: expected the folder of the results of kgs fit")
-    read_json(config)
+        raise DataError(config, "", "this file in the folder of the results of kgs fit", "none")
+
+
+def check_init(init: str, source: "Source") -> None:
+    """Raise an ArgumentError unless a fit can begin with these initial points."""
+    if init == "scene" and (source.scene is None or source.scene.layout != "Blender"):
+        kind = "photos without camera poses" if source.scene is None else f"the layout {source.scene.layout}"
+        raise ArgumentError("init", f"another one for {kind}", "'scene', Blender's points")
+
+
+def check_frames(frames: int | None, source: "Source") -> None:
+    """Raise an ArgumentError unless so many frames can be taken from a video."""
+    from kgs.app.sfm.find import MIN_PHOTOS
+
+    if frames is not None and frames < MIN_PHOTOS:
+        raise ArgumentError("frames", f"at least {MIN_PHOTOS}", frames)
+    if frames is not None and source.video is None:
+        raise ArgumentError("frames", "a video to take them from", "photos")
 
 
 def check_photos(
-    folder: Path,
-    out: Path,
+    source: "Source",
     views: int | None = None,
     hold_out: int | None = None,
-    size: int | None = None,
+    size: int | str | None = None,
     downscale: float | None = None,
     frames: int | None = None,
     shortest: int = 1,
 ) -> None:
-    """Check a folder of unposed photos or a video, and the options about them, before their cameras are found.
+    """Check that a scene has photos; of unposed photos check the options before their cameras are found.
 
     Args:
-        folder: of the photos, or a video. Of a video only the largest number of frames is known.
-        out: the folder for the results.
+        source: a scene, photos, or a video, of which only the largest number of frames is known.
         views: to train on.
         hold_out: every Nth photo is held out.
         size: longer side of the photos in the fit; it needs the photos' headers, as `downscale` does.
@@ -86,28 +115,29 @@ def check_photos(
         frames: to be taken from a video.
         shortest: least pixels of the shorter side in the fit.
     """
-    from kgs.app.sfm.find import MAX_FRAMES, find_photos, find_video
-    from kgs.app.sfm.workspace import check_workspace
+    from kgs.app.sfm.find import MAX_FRAMES
 
-    if find_video(folder):
+    if source.scene is not None:
+        check_photos_of(source.scene)
+        return
+    check_installed("pycolmap")
+    if source.video is not None:
         _check_views(views, hold_out, MAX_FRAMES if frames is None else frames, "frames")
         return
-    paths = find_photos(folder)
-    check_workspace(out, paths)
-    _check_views(views, hold_out, len(paths), "photos")
+    _check_views(views, hold_out, len(source.photos), "photos")
     if size is None and downscale is None:
         return
 
-    from kgs.datasets.image_file import read_size
+    from kgs.datasets.image_file import ImageFile
 
-    width, height = min(read_size(path) for path in paths)
+    width, height = min(ImageFile(path).size for path in source.photos)
     name = "size" if downscale is None else "downscale"
-    factor = max(1.0, max(width, height) / size) if size is not None else downscale or 1.0
+    factor = max(1.0, max(width, height) / size) if isinstance(size, int) else downscale or 1.0
     reduced = [max(1, round(side / factor)) for side in (width, height)]
     for side, minimum, pixels in (("longer", SMALLEST, max(reduced)), ("shorter", shortest, min(reduced))):
         if pixels < minimum:
             got = f"{reduced[0]}x{reduced[1]} of {width}x{height}"
-            raise ArgumentError(f"{name}: expected {minimum} pixels or more of the {side} side, got {got}")
+            raise ArgumentError(name, f"{minimum} pixels or more of the {side} side", got)
 
 
 def _check_views(views: int | None, hold_out: int | None, count: int, what: str) -> None:
@@ -115,4 +145,4 @@ def _check_views(views: int | None, hold_out: int | None, count: int, what: str)
     maximum = count - len(held_out_between_ends(count - 2, hold_out)) if hold_out else count
     if views is not None and views > maximum:
         rest = f" of which {count - maximum} are held out" if hold_out else ""
-        raise ArgumentError(f"views: expected at most {maximum} of {count} {what}{rest}, got {views}")
+        raise ArgumentError("views", f"at most {maximum} of {count} {what}{rest}", views)

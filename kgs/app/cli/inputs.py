@@ -4,16 +4,34 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kgs._support.errors import DataError, listed, printable
+from kgs._support.errors import ArgumentError, DataError, listed, printable
+from kgs._support.json_files import read_json
 from kgs.app.console import say
+from kgs.app.scene_request import SceneRequest
 from kgs.datasets.source import SceneSource
 from kgs.fit.config import Recipe
+
+from .checks import check_results
 
 if TYPE_CHECKING:
     import torch
 
     from kgs.datasets.scene import Scene
     from kgs.fit.fit import Fit
+
+
+def open_splat(splat: Path, cameras: Path | None) -> tuple[Path, SceneSource]:
+    """The PLY file of a splat, and its scene: the one that is named, or that of the fit whose folder this is."""
+    if not splat.is_dir():
+        if cameras is None:
+            raise ArgumentError("cameras", "the scene of the PLY file", "none")
+        return splat, SceneSource(cameras)
+    check_results(splat)
+    if cameras is None:
+        path = splat / "config.json"
+        request = read_json(path).get("request")
+        cameras = splat / SceneRequest.from_dict(request if isinstance(request, dict) else {}, path).scene
+    return splat / "splat.ply", SceneSource(cameras)
 
 
 def load_cameras(source: SceneSource, downscale: float | None = None, photos: bool = False, **options: Any) -> "Scene":
@@ -31,11 +49,11 @@ def options_of_fit(ply: Path, source: SceneSource) -> dict[str, Any]:
 
     Empty if the splat does not lie in the folder of a fit to this scene, and the scene is not such a folder.
     """
-    from kgs.app.saved_fit import read_settings
+    from kgs.app.saved_fit import read_request
 
     for folder in (ply.parent, source.root):
         with suppress(DataError):  # there is no fit, or this is a file of another program
-            request, _ = read_settings(folder / "config.json")
+            request = read_request(folder / "config.json")
             if (folder / request.scene).resolve() == source.root.resolve():
                 masks = folder / request.masks if request.masks else None
                 names = ("downscale", "photo_folder", "mask_mode")
@@ -55,7 +73,7 @@ def load_splat(ply: Path, scene: "Scene", device: "torch.device", backend: str) 
 
     model = load_ply(ply, origin=scene.offset)
     if not len(model):
-        raise DataError(ply, "Gaussians", "expected at least one, got none")
+        raise DataError(ply, "Gaussians", "at least one", "none")
     near_plane = Recipe().near_plane * typical_depths(model.means, scene.train.cameras)[0]
     options = RasterOptions(near_plane=near_plane, antialiased=model.antialiased)
     fit = Fit(scene, model.to(device), options, backend)
@@ -79,7 +97,8 @@ def _check_seen(ply: Path, fit: "Fit") -> None:
         if not len(project(gaussians, camera, options=fit.options, colors=False, backend=fit.backend)):
             blind.append(name)
     if len(blind) == len(views):
-        reason = f"expected some that a camera of {printable(fit.scene.root)} sees, got none of {len(fit.model)}"
-        raise DataError(ply, "Gaussians", f"{reason}: are they in the frame of these cameras?")
+        expected = f"some that a camera of {fit.scene.root} sees"
+        advice = "are they in the frame of these cameras?"
+        raise DataError(ply, "Gaussians", expected, f"none of {len(fit.model)}", advice=advice)
     if blind:
         say(f"these cameras see no Gaussian of {printable(ply)}: {listed(blind)}")

@@ -3,12 +3,12 @@
 from pathlib import Path
 
 from kgs._support.errors import DataError
-from kgs.app.console import as_line, each, say, say_next
+from kgs.app.console import as_line, say, say_next
+from kgs.app.files.results import Results
 
-from .checks import check_photos
+from .checks import check_frames
 from .options import IfGiven, Out
 from .tools import check_installed, load_tools
-from .unposed import check_frames, notes_on_photos, open_scene
 
 
 def poses(
@@ -31,25 +31,23 @@ def poses(
         out: folder for the scene: images, sparse/0 (a COLMAP model) and photos.json (how the cameras were found).
         frames: how many frames are taken from a video. Unless given: twelve, fewer where the camera moves little, more
             where it moves far.
-        masks: folder of masks, white where a photo is kept. Unless given: masks/ beside the photos, or
-            IMG_1_mask.png beside IMG_1.jpg.
+        masks: folder of masks, white where a photo is kept: IMG_1.png or IMG_1.jpg.png for IMG_1.jpg. Unless given:
+            masks/ beside the photos.
         seed: of the solvers.
     """
-    from kgs.app.files.publishing import UNFINISHED
-    from kgs.app.files.results_folder import has_fit
+    from kgs.app.sfm.source import Source
 
-    if open_scene(photos) is not None:
-        raise DataError(photos, "", "has camera poses: kgs fit takes it as it is")
-    check_frames(frames, photos)
+    source = Source.open(photos)
+    if source.scene is not None:
+        raise DataError(photos, "", "photos without camera poses", "a scene", advice="kgs fit takes it as it is")
+    check_frames(frames, source)
     check_installed("pycolmap")
-    check_photos(photos, out, frames=frames)
-    if has_fit(out) or has_fit(out / UNFINISHED):
-        raise DataError(out, "", "holds a fit, to which its cameras belong: choose another folder")
-    load_tools()
+    with Results.open(out, "photos", resume=False) as results:
+        load_tools()
 
-    from kgs.app.sfm import pose_photos
+        from kgs.app.sfm.pose import pose
 
-    for note in notes_on_photos(photos, masks):
-        say(note)
-    pose_photos(photos, out, seed=seed, masks=masks, frames=frames, bar=each, say=say)
+        for note in source.notes(masks):
+            say(note)
+        pose(source, results, seed=seed, masks=masks, frames=frames)
     say_next(as_line("kgs", "fit", out, "-o", Path(f"{out.resolve().name}-fit")))

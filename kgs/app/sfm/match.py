@@ -16,6 +16,7 @@ from kgs._support.progress import ProgressBar
 from kgs.init_points.keypoints import root_sift
 
 from .read import Photo
+from .write import write_images
 
 SMALL = 1000  # pixels of the longer side; SIFT sees smaller photos at twice their size
 MIN_KEYPOINTS = 4096  # of one photo
@@ -36,7 +37,7 @@ class PhotoKeypoints(NamedTuple):
 
 
 def find_keypoints(photo: Photo, max_count: int) -> PhotoKeypoints:
-    """The strongest SIFT keypoints of a photo where it is kept, up to `max_count`; nothing is random."""
+    """The strongest SIFT keypoints of a photo where it is kept, up to `max_count`."""
     factor = 2 if max(photo.size) < SMALL else 1
     keypoints = root_sift(photo.grey(), max_count, factor, photo.mask, contrastThreshold=_CONTRAST)
     pixels = (keypoints.pixels + 0.5).float()
@@ -46,21 +47,24 @@ def find_keypoints(photo: Photo, max_count: int) -> PhotoKeypoints:
     return PhotoKeypoints(pixels, keypoints.descriptors, frames)
 
 
-def write_matches(database: Path, photos: list[Photo], names: list[str], bar: ProgressBar) -> None:
+def write_matches(database: Path, photos: list[Photo], names: list[str], lenses: list[Any], bar: ProgressBar) -> None:
     """Make a COLMAP database of all photos with their lenses, their keypoints and the matches of each pair.
 
     Args:
         database: the file to write.
         photos: the photos, all of one size.
         names: their names in the database.
+        lenses: first guesses of their lenses, see :func:`lenses_of`.
         bar: wraps the loops to show their progress, see :mod:`kgs._support.progress`.
     """
+    import pycolmap
+
     # The cost of matching grows with the squares of both counts, so many photos get fewer keypoints each.
     max_count = min(MAX_KEYPOINTS, max(MIN_KEYPOINTS, ALL_KEYPOINTS // len(photos)))
     keypoints = [find_keypoints(photo, max_count) for photo in bar(photos, "keypoints", "photo")]
     area = photos[0].size[::-1]
-    with _open(database) as file:
-        ids = _write_photos(file, photos, names)
+    with pycolmap.Database.open(database) as file:
+        ids = _write_photos(file, photos, names, lenses)
         for image_id, of_photo in zip(ids, keypoints, strict=True):
             file.write_keypoints(image_id, of_photo.pixels.numpy())
         for i, j in bar(list(combinations(range(len(photos)), 2)), "matches", "pair"):
@@ -98,22 +102,10 @@ def _match(first: PhotoKeypoints, second: PhotoKeypoints, area: tuple[int, ...])
     return torch.stack([rows[pairs[:, 0]], columns[pairs[:, 1]]], dim=1)
 
 
-def _open(database: Path) -> Any:
-    import pycolmap
-
-    return pycolmap.Database.open(database)
-
-
 def exif_focal(photos: list[Photo]) -> float | None:
     """The median focal length in pixels that the photos' Exif gives, None if none does."""
     known = [photo.focal for photo in photos if photo.focal]
     return median_high(known) if known else None
-
-
-def exif_focals(photos: list[Photo]) -> list[float | None]:
-    """The same for each lens, in the order of their numbers."""
-    count = 1 + max(photo.lens for photo in photos)
-    return [exif_focal([photo for photo in photos if photo.lens == number]) for number in range(count)]
 
 
 def lenses_of(photos: list[Photo]) -> list[Any]:
@@ -122,29 +114,28 @@ def lenses_of(photos: list[Photo]) -> list[Any]:
 
     width, height = photos[0].size
     cameras = []
-    for camera_id, known in enumerate(exif_focals(photos), 1):
+    for number in range(1 + max(photo.lens for photo in photos)):
+        known = exif_focal([photo for photo in photos if photo.lens == number])
         focal = known or DEFAULT_FOCAL * max(width, height)
-        camera = pycolmap.Camera.create_from_model_name(camera_id, "SIMPLE_RADIAL", focal, width, height)
+        camera = pycolmap.Camera.create_from_model_name(number + 1, "SIMPLE_RADIAL", focal, width, height)
         camera.has_prior_focal_length = known is not None
         cameras.append(camera)
     return cameras
 
 
-def _write_photos(file: Any, photos: list[Photo], names: list[str]) -> list[int]:
-    """Write the lenses, and the photos; returns the photos' ids."""
+def _write_photos(file: Any, photos: list[Photo], names: list[str], lenses: list[Any]) -> list[int]:
+    """The ids of the photos, which are written with their lenses."""
     import pycolmap
 
-    cameras = lenses_of(photos)
     rig_ids = []
-    for camera in cameras:
-        camera.camera_id = file.write_camera(camera)
+    for lens in lenses:
+        lens.camera_id = file.write_camera(lens)
         rig = pycolmap.Rig()
-        rig.add_ref_sensor(camera.sensor_id)
+        rig.add_ref_sensor(lens.sensor_id)
         rig_ids.append(file.write_rig(rig))
     ids = []
     for photo, name in zip(photos, names, strict=True):
-        camera = cameras[photo.lens]
-        image = pycolmap.Image(name=name, camera_id=camera.camera_id)
+        image = pycolmap.Image(name=name, camera_id=lenses[photo.lens].camera_id)
         image.image_id = file.write_image(image)
         frame = pycolmap.Frame()
         frame.rig_id = rig_ids[photo.lens]
@@ -152,3 +143,21 @@ def _write_photos(file: Any, photos: list[Photo], names: list[str]) -> list[int]
         file.write_frame(frame)
         ids.append(image.image_id)
     return ids
+
+
+def colmap_matching(
+    photos: list[Photo], lenses: list[Any], images: Path, masks: Path, work: Path, names: list[str]
+) -> dict[str, Any]:
+    """What the step `write_colmap_matches` takes: folders, names of each lens's photos, and the lens if it is known.
+
+    Photos with alpha are written again over black: COLMAP would find keypoints in what alpha hides.
+    """
+    if not all(photo.is_opaque for photo in photos):
+        images = work / "opaque"
+        images.mkdir()
+        write_images(images, photos, names, opaque=True)
+    of_lens = []
+    for number, lens in enumerate(lenses):
+        shown = [name for photo, name in zip(photos, names, strict=True) if photo.lens == number]
+        of_lens.append((shown, lens.params_to_string() if lens.has_prior_focal_length else None))
+    return {"images": str(images), "masks": str(masks) if masks.is_dir() else None, "lenses": of_lens}

@@ -18,25 +18,35 @@ from kgs._support.errors import DataError, printable
 from kgs._support.json_files import read_json, write_json
 from kgs._support.machine import versions
 from kgs._support.progress import ProgressBar, silent
-from kgs.app.console import say
-from kgs.app.files.locks import locked
+from kgs.app.console import each, say
+from kgs.app.files.fit_files import has_fit
 from kgs.app.files.outputs import png_names
-from kgs.app.files.publishing import UNFINISHED, complete, discard, replacing
-from kgs.app.files.results_folder import check_no_fit
+from kgs.app.files.results import Results
+from kgs.datasets.folders import CAMERAS_REPORT as REPORT
 from kgs.datasets.image_file import color_notes
 
-from .agree import agreed_cameras, say_left_out
-from .find import find_photos, find_video
-from .gates import FOCAL_RANGE, MAX_DEGREES, MAX_RATIO, MIN_POINTS, MIN_RISE
-from .leave_out import unlike_others
+from .accept import (
+    FOCAL_RANGE,
+    MAX_DEGREES,
+    MAX_RATIO,
+    MIN_POINTS,
+    MIN_RISE,
+    Accepted,
+    accepted_cameras,
+    say_left_out,
+)
 from .map import Cameras, quiet_pycolmap
 from .match import exif_focal
 from .pycolmap_processes import check_space
-from .read import FILM_DIAGONAL, OpenPhoto, Photo, blurred, open_photos, read_photos
+from .read import FILM_DIAGONAL, OpenPhoto, Photo, blurred, open_photos, read_photos, unlike_others
+from .source import Source
 from .video import take_frames
-from .workspace import IMAGES, MASKS, MODEL, REPORT, check_workspace, is_reusable
 from .write import level_and_scale, upright, write_images, write_masks, write_model
 
+IMAGES = "images"
+MASKS = "masks"
+MODEL = "sparse/0"
+_MODEL_FILES = ("cameras", "images", "points3D")
 SETTINGS = 9  # increased by every change after which the same photos give other files
 
 
@@ -47,7 +57,6 @@ def pose_photos(
     seed: int = 0,
     masks: str | PathLike[str] | None = None,
     frames: int | None = None,
-    wait: bool = False,
     bar: ProgressBar = silent,
     say: Callable[[str], None] = say,
 ) -> dict[str, Any]:
@@ -67,13 +76,10 @@ def pose_photos(
             length, else they are left out. Folders in it are not looked into. Or a video, or a folder with one and
             without photos.
         out: the folder for the results, created if it does not exist.
-        masks: the folder of their masks, white where a photo is kept; None: `masks` in `folder`, if there is one, and
-            masks beside the photos, as `IMG_1_mask.png`. What is black is not matched, and `out` gets the masks in
-            `masks`.
+        masks: the folder of their masks, white where a photo is kept; None: `masks` in `folder`, if there is one.
+            What is black is not matched, and `out` gets the masks in `masks`.
         seed: of the solvers. The same photos and seed give the same files, but for the times in photos.json.
         frames: the number of frames that are taken from a video; see :func:`kgs.app.sfm.video.take_frames`.
-        wait: write new files to the folder `unfinished` in `out`, until a fit to them is done: a former one in `out`
-            belongs to the former cameras.
         bar: wraps the loops to show their progress, see :mod:`kgs._support.progress`.
         say: called with each line for the user.
 
@@ -91,64 +97,109 @@ def pose_photos(
         ModuleNotFoundError: pycolmap is not installed (extra `sfm`).
         OSError: a result cannot be written.
     """
-    folder = Path(folder)
-    out = Path(out)
-    options: dict[str, Any] = {"seed": seed, "masks": masks, "wait": wait, "bar": bar, "say": say}
-    if video := find_video(folder):
-        return _pose_video(video, out, frames, options)
+    with Results.open(Path(out), "photos", resume=False) as results:
+        masks = None if masks is None else Path(masks)
+        return pose(Source.unposed(Path(folder)), results, seed=seed, masks=masks, frames=frames, bar=bar, say=say)
+
+
+def pose(
+    source: Source,
+    results: Results,
+    *,
+    seed: int,
+    masks: Path | None,
+    frames: int | None,
+    for_fit: bool = False,
+    bar: ProgressBar = each,
+    say: Callable[[str], None] = say,
+) -> dict[str, Any]:
+    """As :func:`pose_photos`, in a folder that is open.
+
+    Args:
+        source: the photos or the video.
+        results: the folder.
+        seed: of the solvers.
+        masks: the folder of their masks.
+        frames: the number of frames that are taken from a video.
+        for_fit: write new files to `results.work`, until a fit to them is done: a former one in the folder belongs to
+            the former cameras.
+        bar: wraps the loops to show their progress.
+        say: called with each line for the user.
+    """
+    if source.video is not None:
+        return _pose_video(source.video, results, frames, seed=seed, masks=masks, for_fit=for_fit, bar=bar, say=say)
     with quiet_pycolmap():  # a missing package is an error before any work
         pass
-    paths = find_photos(folder)
-    check_workspace(out, paths)
-    opened = open_photos(paths, None if masks is None else Path(masks))
+    if source.path.resolve().is_relative_to(results.out.resolve()):
+        raise DataError(results.out, "", "another folder than that of the photos", advice="choose another folder")
+    opened = open_photos([*source.photos], masks)
     inputs = {
         "settings": SETTINGS,
         "seed": seed,
         "sha256": {photo.name: photo.sha256 for photo in opened},
         "masks_sha256": {photo.name: sha256(photo.mask.file.load()).hexdigest() for photo in opened if photo.mask},
     }
-    out.mkdir(parents=True, exist_ok=True)
-    with locked(out):
-        complete(out)
-        new_folder = out / UNFINISHED if wait else out
-        posed = next((path for path in (new_folder, out) if is_reusable(path, inputs)), None)
-        is_reused = posed is not None
-        if posed is None:
-            posed = new_folder
-            if wait:
-                check_no_fit(posed)  # it is one of other cameras
-            try:
-                with replacing(posed, "photos", all_former=True) as new:
-                    write_json(new / REPORT, inputs | find_cameras(opened, new, seed % 2**31, bar, say))
-            except BaseException:
-                if wait:
-                    discard(posed, "photos")
-                raise
-        else:
-            say(f"cameras: those in {printable(posed)} are of the same {len(paths)} photos and are used again")
-        report = read_json(posed / REPORT)
-        if is_reused:
+    for folder in (results.work, results.out) if for_fit else (results.out,):
+        if (report := _reusable_report(folder, inputs)) is not None:
+            say(f"cameras: those in {printable(folder)} are of the same {len(opened)} photos and are used again")
             say_left_out(report.get("left_out", {}), say)
-        return {**report, "reused": is_reused, "folder": str(posed)}
+            return {**report, "reused": True, "folder": str(folder)}
+    with _new_folder(results, for_fit) as new:
+        report = inputs | find_cameras(opened, new, seed % 2**31, bar, say)
+        write_json(new / REPORT, report)
+    return {**report, "reused": False, "folder": str(results.work if for_fit else results.out)}
 
 
-def _pose_video(video: Path, out: Path, frames: int | None, options: dict[str, Any]) -> dict[str, Any]:
+def _pose_video(video: Path, results: Results, frames: int | None, **options: Any) -> dict[str, Any]:
     """Find the cameras of a video's frames; errors about these name the video."""
     with TemporaryDirectory(prefix="kgs-") as name:
         folder = Path(name) / video.stem
         folder.mkdir()
-        take_frames(video, folder, frames, options["bar"], options["say"])
+        photos = take_frames(video, folder, frames, options["bar"], options["say"])
         try:
-            return pose_photos(folder, out, **options)
+            return pose(Source(folder, photos=tuple(photos)), results, frames=None, **options)
         except DataError as error:
             path = video if Path(error.path) == folder else error.path
-            raise type(error)(path, error.field, error.reason) from error
+            raise type(error)(path, error.key, error.expected, error.got, advice=error.advice) from error
+
+
+def _reusable_report(folder: Path, inputs: dict[str, Any]) -> dict[str, Any] | None:
+    """The report of a former run with the same inputs, whose files are there."""
+    try:
+        report = read_json(folder / REPORT)
+    except DataError:
+        return None
+    if any(report.get(key, {}) != inputs[key] for key in inputs):
+        return None
+    images = [photo["image"] for photo in report["photos"].values()]
+    names = [f"{IMAGES}/{image}" for image in images] + [f"{MODEL}/{name}.bin" for name in _MODEL_FILES]
+    names += [f"{MASKS}/{image}.png" for image in images] if inputs["masks_sha256"] else []
+    return report if all((folder / name).is_file() for name in names) else None
+
+
+@contextmanager
+def _new_folder(results: Results, for_fit: bool) -> Iterator[Path]:
+    """The folder for new files: that of a new fit, which nothing remains in after an error, or one to be published."""
+    if not for_fit:
+        with results.stage() as new:
+            yield new
+        return
+    if has_fit(results.work):
+        raise DataError(results.work, "", "no fit", "one of other photos that is not done", advice="remove this folder")
+    results.begin()
+    results.discard("photos")
+    results.work.mkdir(exist_ok=True)
+    try:
+        yield results.work
+    except BaseException:
+        results.discard("photos")
+        raise
 
 
 def find_cameras(
     opened: list[OpenPhoto], new: Path, seed: int, bar: ProgressBar, say: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Write `images` and `sparse/0` of photos to the folder `new`; returns the report.
+    """Write `images`, `masks` and `sparse/0` of photos to the folder `new`; returns the report.
 
     Raises:
         PhotosRefused: the photos do not fit together, or their cameras cannot be trusted.
@@ -157,66 +208,90 @@ def find_cameras(
     unlike = unlike_others(opened)
     say_left_out(unlike, say)
     opened = [photo for photo in opened if photo.name not in unlike]
-    names = [photo.name for photo in opened]
+    png = png_names([photo.name for photo in opened])
+    names = {image: name for name, image in png.items()}
     work = new / "work"
-    images = new / IMAGES
-    for path in (images, work):
-        path.mkdir(parents=True)
-    with _one_thread(), report_full_disk(new):
+    work.mkdir(parents=True)
+    with quiet_pycolmap(), _one_thread(), report_full_disk(new):
         photos = read_photos(opened, bar)
-        for photo in photos:
-            if photo.whole:
-                say(f"{photo.name}: only its middle is taken, because it has another shape than most photos")
-        for note in color_notes([photo.image for photo in opened]):
-            say(note)
         unsharp = [photo.name for photo in blurred(photos)]
-        if unsharp:
-            say(f"blurred beside the others: {', '.join(unsharp)}; if the fit shows it, take them again")
-        png = png_names(names)
-        photo_names = {image: name for name, image in png.items()}
-        folders = images, new / MASKS
-        write_images(images, [photo.upright() for photo in photos], list(png.values()))
-        write_masks(new / MASKS, [photo.upright() for photo in photos], list(png.values()))
+        _say_notes(opened, photos, unsharp, say)
+        folders = _write_photos(new, [photo.upright() for photo in photos], list(names))
         turned = {photo.name for photo in photos if photo.is_turned}
         if turned:
-            folders = work / IMAGES, work / MASKS
-            folders[0].mkdir()
-            write_images(folders[0], photos, list(png.values()))
-            write_masks(folders[1], photos, list(png.values()))
+            folders = _write_photos(work, photos, list(names))
         lap("photos")
-        found = agreed_cameras(photos, *folders, work, photo_names, seed, bar, lap, say)
-        for name in found.left_out:
-            (images / png[name]).unlink()
+        found = accepted_cameras(photos, *folders, work, names, seed, bar, lap, say)
+        for name in found.rejected:
+            (new / IMAGES / png[name]).unlink()
             (new / MASKS / f"{png[name]}.png").unlink(missing_ok=True)
         if found.held:
             focals = " and ".join(f"{focal:.0f}" for focal in found.held)
             say(f"the photos do not tell the focal length; the Exif says {focals} pixels, and that is taken")
-        photos = [photo for photo in photos if photo.name not in found.left_out]
-        chosen = upright(found.cameras, turned, photo_names)
-        level_and_scale(chosen)
-        write_model(new / MODEL, chosen, images)
+        cameras = upright(found.cameras, turned, names)
+        level_and_scale(cameras)
+        write_model(new / MODEL, cameras, new / IMAGES)
         shutil.rmtree(work)
         lap("files")
-    error = float(chosen.reconstruction.compute_mean_reprojection_error())
-    say(f"cameras: {len(photos)} photos placed, {chosen.reconstruction.num_points3D()} points, {error:.2f} pixels off")
+    placed = [photo for photo in photos if photo.name not in found.rejected]
+    report = _report(found, cameras, placed)
+    points, error = report["points"], report["reprojection_error_px"]
+    say(f"cameras: {len(placed)} photos placed, {points} points, {error:.2f} pixels off")
     return {
-        **_lens(chosen, photos),
+        **report,
         "photo_size": list(min(photo.size for photo in opened)),
-        "focal_rise": None if found.held else chosen.focal_rise,
         "photos": {
             photo.name: {
                 "image": png[photo.name],
-                "points": chosen.points[photo.name],
+                "points": cameras.points[photo.name],
                 "blurred": photo.name in unsharp,
-                "focal_px": chosen.focals[photo.name],
+                "focal_px": cameras.focals[photo.name],
                 "exif_focal_35mm": photo.exif.focal_35mm,
             }
-            for photo in photos
+            for photo in placed
         },
-        "left_out": unlike | found.left_out,
+        "left_out": unlike | found.rejected,
+        "seconds": seconds,
+        "versions": {**versions(), "pycolmap": version("pycolmap")},
+    }
+
+
+def _say_notes(opened: list[OpenPhoto], photos: list[Photo], unsharp: list[str], say: Callable[[str], None]) -> None:
+    for photo in photos:
+        if photo.is_cut:
+            say(f"{photo.name}: only its middle is taken, because it has another shape than most photos")
+    for note in color_notes([photo.image for photo in opened]):
+        say(note)
+    if odd := [photo.name for photo in opened if photo.has_odd_focal]:
+        say(f"a focal length in the Exif that no lens has is passed over: {', '.join(odd)}")
+    if unsharp:
+        say(f"blurred beside the others: {', '.join(unsharp)}; if the fit shows it, take them again")
+
+
+def _write_photos(folder: Path, photos: list[Photo], names: list[str]) -> tuple[Path, Path]:
+    """Write photos and their masks; returns the folders of both. That of the masks is not there if there are none."""
+    (folder / IMAGES).mkdir()
+    write_images(folder / IMAGES, photos, names)
+    write_masks(folder / MASKS, photos, names)
+    return folder / IMAGES, folder / MASKS
+
+
+def _report(found: Accepted, cameras: Cameras, photos: list[Photo]) -> dict[str, Any]:
+    """What the report says about the cameras and the lens of most photos."""
+    scene = cameras.reconstruction
+    usual = [photo for photo in photos if cameras.focals[photo.name] == cameras.focal]
+    lens = next(lens for lens in scene.cameras.values() if lens.focal_length == cameras.focal)
+    width, height = photos[0].size
+    return {
+        "size": [width, height],
+        "focal_px": cameras.focal,
+        "focal_35mm": cameras.focal * FILM_DIAGONAL / float((width**2 + height**2) ** 0.5),
+        "exif_focal_px": exif_focal(usual),
+        "focal_rise": None if found.held else cameras.focal_rise,
+        "radial_distortion": float(lens.params[3]),
         "matches": [[*pair, count] for pair, count in found.pairs.items()],
-        "points": chosen.reconstruction.num_points3D(),
-        "reprojection_error_px": error,
+        "points": scene.num_points3D(),
+        "reprojection_error_px": float(scene.compute_mean_reprojection_error()),
         "solver": found.solver,
         "agreement_degrees": found.degrees,
         "gates": {
@@ -227,24 +302,6 @@ def find_cameras(
             "min_focal_rise": MIN_RISE,
             "passed": True,
         },
-        "seconds": seconds,
-        "versions": {**versions(), "pycolmap": version("pycolmap")},
-    }
-
-
-def _lens(cameras: Cameras, photos: list[Photo]) -> dict[str, Any]:
-    """What the report says about image size and the lens of most photos."""
-    usual = [photo for photo in photos if cameras.focals[photo.name] == cameras.focal]
-    scene = cameras.reconstruction
-    lens = next(lens for lens in scene.cameras.values() if lens.focal_length == cameras.focal)
-    width, height = photos[0].size
-    film = cameras.focal * FILM_DIAGONAL / float((width**2 + height**2) ** 0.5)
-    return {
-        "size": [width, height],
-        "focal_px": cameras.focal,
-        "focal_35mm": film,
-        "exif_focal_px": exif_focal(usual),
-        "radial_distortion": float(lens.params[3]),
     }
 
 

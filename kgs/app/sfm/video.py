@@ -72,8 +72,8 @@ def take_frames(
     way = frames[-1].way
     min_way = _STEP * ((count or MIN_PHOTOS) - 1)
     if way < min_way or len(frames) < MIN_PHOTOS:
-        expected = f"expected a video in which the camera moves by {min_way:g} degrees or more"
-        raise PhotosRefused(video, "", f"{expected}, got {way:.1f} degrees in {len(frames)} frames")
+        expected = f"a video in which the camera moves by {min_way:g} degrees or more"
+        raise PhotosRefused(video, "", expected, f"{way:.1f} degrees in {len(frames)} frames")
     if count is None:
         count = max(MIN_PHOTOS, min(FRAMES, round(way / MIN_DEGREES) + 1))
         count = max(count, min(MAX_FRAMES, math.ceil(way / MAX_DEGREES) + 1))
@@ -83,7 +83,7 @@ def take_frames(
         for index in bar(indices, "frames", "frame"):
             pixels = reader.read(index)
             if pixels is None:
-                raise DataError(video, "", f"frame {index} cannot be read a second time")
+                raise DataError(video, "", f"frame {index} a second time", "none")
             paths.append(folder / f"frame_{index:05d}.png")
             write_png(paths[-1], torch.from_numpy(pixels[..., ::-1].copy()).permute(2, 0, 1))
     say(f"{video.name}: {len(paths)} frames, {way / (len(paths) - 1):.0f} degrees apart in the mean")
@@ -100,10 +100,13 @@ def _look(video: Path, bar: ProgressBar) -> list[_Frame]:
             pixels = reader.read(index)
             if pixels is None:
                 break
-            grey = _small(pixels)
+            scale = min(1.0, _LONGEST / max(pixels.shape))
+            full = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
+            resized = cv2.resize(full, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+            grey = np.asarray(resized, np.uint8)
             frames.append(_Frame(index, sharpness(grey), motion.way_to(grey)))
     if not frames:
-        raise DataError(video, "", "expected a video, got a file without frames that can be decoded")
+        raise DataError(video, "", "a video", "a file without frames that can be decoded")
     return frames
 
 
@@ -165,7 +168,7 @@ class _Reader:
     def __init__(self, video: Path) -> None:
         path = for_opencv(video)
         if path is None:
-            raise DataError(video, "", f"expected a video that OpenCV can open: {NOT_UTF8}")
+            raise DataError(video, "", "a video that OpenCV can open", advice=f"{NOT_UTF8}")
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # else FFmpeg writes of damage to stderr
         self._capture = cv2.VideoCapture(str(path))
         self._next = 0
@@ -177,7 +180,7 @@ class _Reader:
         self._pixel_width = self._aspect()  # over its height
 
     def _aspect(self) -> float:
-        """Width over height of a pixel of an upright frame; 1 where the header does not say."""
+        """Width over height of a pixel of an upright frame, or 1."""
         width, height = (self._capture.get(key) for key in (cv2.CAP_PROP_SAR_NUM, cv2.CAP_PROP_SAR_DEN))
         if not (width > 0 and height > 0 and 1 / _WIDEST_PIXEL <= width / height <= _WIDEST_PIXEL):
             return 1.0
@@ -191,7 +194,7 @@ class _Reader:
         self._capture.release()
 
     def read(self, index: int) -> NDArray[np.uint8] | None:
-        """A frame, `(H, W, 3)` BGR, not before the last one that was read; None behind the end.
+        """A frame, `(H, W, 3)` BGR, behind the last one that was read, or None behind the end.
 
         It is never made smaller to have square pixels.
         """
@@ -207,9 +210,3 @@ class _Reader:
         if size == (width, height):
             return np.asarray(pixels, np.uint8)
         return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_CUBIC), np.uint8)
-
-
-def _small(pixels: NDArray[np.uint8]) -> Grey:
-    scale = min(1.0, _LONGEST / max(pixels.shape))
-    grey = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
-    return np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
