@@ -14,11 +14,11 @@ ROOT = Path(__file__).parents[2]
 SOURCE = ("kgs", "losses", "datasets")
 LONGEST = 80  # lines of code of a function, without its docstring, comments and empty lines
 _SKIPPED = (tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT)
-# what is asked or put together once, by the functions that do it: only their callers count
+# what is asked or put together in one place, by the functions that do it
 ONCE = {
-    "assembly of a fit": ("Trainer", "Trainer.resume"),
-    "a folder of results is looked at": ("check_folder", "Results.open"),
-    "a folder of results is locked": ("locked", "FileLock"),
+    "assembly of a fit": ("make_plan", "hooks.make_trainer"),
+    "a folder of results is looked at": ("_check_folder",),
+    "a folder of results is locked": ("FileLock",),
 }
 
 

@@ -228,57 +228,6 @@ def test_public_names_say_what_they_take_and_return(module):
     assert not [line for name, value in values if callable(value) for line in described(name, value)]
 
 
-# -- words ---------------------------------------------------------------------------------------------------------
-
-GONE = {  # private words, and the field's in their stead
-    "needs": "decisions",
-    "pace": "StepDefaults",
-    "timetable": "Schedule",
-    "counted": "valid_mask",
-    "finer": "train_full_size",
-    "halved": "downsample",
-    "recolored": "color_corrected",
-    "recolor": "correct_color",
-    "comparable": "clipped_psnr",
-    "decibels": "masked_psnr",
-    "training_levels": "psnr_per_view",
-    "keep_all": "prune",
-    "undropped_steps": "no_drop_steps",
-    "mask_means": "mask_mode",
-    "half_axes": "covariance_factors",
-    "agreed_pixels": "consistent_pixels",
-    "paced": "resample_by_speed",
-    "photos_per_place": "views_per_patch",
-    "photos_per_pair": "views_per_pair",
-}
-PARTS_GONE = {"place": "device, folder, pixels, rows, centers", "most": "max", "least": "min", "fewest": "min"}
-AUTOGRAD = {"needs"}  # of torch: needs_input_grad
-
-
-def words(node):
-    """The names that a part of the code uses, and strings that are one."""
-    match node:
-        case ast.Name(id=word) | ast.Attribute(attr=word) | ast.FunctionDef(name=word) | ast.ClassDef(name=word):
-            yield word
-        case ast.arg(arg=str(word)) | ast.keyword(arg=str(word)):
-            yield word
-        case ast.Constant(value=str(word)) if re.fullmatch(r"\w+", word):
-            yield word
-
-
-def test_words_that_are_gone_stay_gone():
-    """Names in code, and option names and keys in strings; prose is not searched."""
-    found = []
-    for module in SOURCES:
-        for name in {word for node in nodes(module) for word in words(node)}:
-            word = name.strip("_").lower()
-            allowed = within(module, "kgs.backends", "kgs.stages") and word in AUTOGRAD
-            parts = set(word.removesuffix("s").split("_")) & PARTS_GONE.keys()
-            if (word in GONE and not allowed) or (parts and not word.endswith(("most_common", "at_least", "at_most"))):
-                found.append(f"{module}: {name}: {GONE.get(word) or [PARTS_GONE[part] for part in parts]}")
-    assert not found
-
-
 def test_no_file_names_a_path_on_a_disk():
     tracked = [path for folder in (*PACKAGES, "tests", "docs", ".ci") for path in (ROOT / folder).rglob("*")]
     texts = [path for path in tracked if path.suffix in {".py", ".md", ".json", ".jsonl", ".csv", ".tex", ".html", ""}]
