@@ -16,7 +16,7 @@ LONGEST = 80  # lines of code of a function, without its docstring, comments and
 _SKIPPED = (tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT)
 # what is asked or put together in one place, by the functions that do it
 ONCE = {
-    "assembly of a fit": ("make_plan", "hooks.make_trainer"),
+    "assembly of a fit": ("hooks.make_trainer",),
     "a folder of results is looked at": ("_check_folder",),
     "a folder of results is locked": ("FileLock",),
 }
