@@ -14,7 +14,8 @@ from kgs.camera import move_camera
 from kgs.datasets.scene import Scene, Views
 from kgs.metrics.evaluate import mean_psnr
 from kgs.model import GaussianModel
-from kgs.renderer import GaussianRenderer, blend
+from kgs.renderer import GaussianRenderer
+from kgs.stages import blend
 from kgs.types import RasterOptions
 
 from .config import Settings

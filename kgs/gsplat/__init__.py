@@ -10,8 +10,7 @@ from torch import Tensor
 from kgs._support.errors import ArgumentError
 from kgs.backends import Backend, get_backend
 from kgs.projection import normals
-from kgs.renderer import blend
-from kgs.stages import project, rasterize
+from kgs.stages import blend, project, rasterize
 from kgs.types import ProjectedGaussians, RasterOptions, check_tensor
 
 from .arguments import check_words, refuse

@@ -10,7 +10,7 @@ from kornia.sensors.camera import CameraModelType
 
 import kgs
 from kgs import GaussianRenderer
-from kgs.renderer import blend
+from kgs.stages import blend
 
 pytestmark = pytest.mark.usefixtures("each_backend")
 
