@@ -9,8 +9,8 @@ from torch import Tensor
 
 from kgs._support.errors import DataError, quoted
 from kgs._support.json_files import read_json
-from kgs.app.files.publishing import complete
-from kgs.app.files.results_folder import CHECKPOINT
+from kgs.app.files.fit_files import CHECKPOINT
+from kgs.app.files.results import complete
 from kgs.backends import get_backend
 from kgs.datasets.scene import Scene
 from kgs.fit.checkpoint import errors_of, newest_checkpoint

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import pytest
 import torch
+from fits_in_folders import fit_in
 
 from kgs import DataError, backends
 from kgs._support.json_files import read_json
-from kgs.app.files.results_folder import CHECKPOINT
-from kgs.app.fit_folder import fit_folder
+from kgs.app.files.fit_files import CHECKPOINT
 from kgs.app.saved_fit import load_fit
 from kgs.app.scene_request import SceneRequest
 from kgs.backends import get_backend
@@ -53,7 +53,7 @@ def test_auto_is_numba_where_it_is_installed_and_the_device_is_a_cpu(installed):
 @pytest.mark.parametrize(("asked", "made"), [("auto", "numba"), ("torch", "torch")])
 def test_the_choice_is_kept_with_the_results(installed, scene, tmp_path, monkeypatch, asked, made):
     monkeypatch.setattr(SceneRequest, "load", lambda *_: scene)
-    published = fit_folder(scene, replace(CONFIG, backend=asked), tmp_path, SceneRequest("somewhere"))
+    published = fit_in(scene, replace(CONFIG, backend=asked), tmp_path, SceneRequest("somewhere"))
     assert published.fit.metrics["backend"] == made
     assert read_json(tmp_path / "config.json")["fit"]["backend"] == asked
     fit = load_fit(tmp_path)[1]

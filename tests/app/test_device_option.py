@@ -13,8 +13,8 @@ from kgs import backends
 from kgs._support.json_files import read_json, write_json
 from kgs.app.cli import tools
 from kgs.app.cli.run import COMMANDS, load_command
-from kgs.app.files.publishing import UNFINISHED
-from kgs.app.files.results_folder import CHECKPOINT
+from kgs.app.files.fit_files import CHECKPOINT, UNFINISHED
+from kgs.app.files.results import MARKER
 
 QUICK = ("--init", "random", "--init-points", 30, "--evaluations", 1)
 
@@ -116,9 +116,10 @@ def test_a_fit_of_a_cpu_goes_on_there_where_there_is_a_gpu_too(
     if begun is not None:
         (work / CHECKPOINT).touch()
         write_json(work / "config.json", {"fit": {"device": begun}})
-    monkeypatch.setattr("kgs.app.files.results_folder.check_fit_files", lambda *_: None)
+    write_json(work.parent / MARKER, {"files": {}})
     monkeypatch.setattr("kgs.app.fit_folder.fit_folder", lambda *_, **__: (_ for _ in ()).throw(SystemExit(7)))
     for options, expected in ((("--resume",), taken), (("--resume", "--device", "cuda"), "cuda"), ((), "cuda")):
-        assert run("fit", folder, "-o", tmp_path / "out", *options, *QUICK) == 7
+        out = tmp_path / ("out" if "--resume" in options else "new")
+        assert run("fit", folder, "-o", out, *options, *QUICK) == 7
         named = capsys.readouterr().out.splitlines()[0]
         assert named.startswith("device: CPU, " if expected == "cpu" else "device: Card 9000 (cuda)")
