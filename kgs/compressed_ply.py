@@ -16,12 +16,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kgs._support.checks import check_kind
 from kgs._support.errors import ArgumentError
 from kgs._support.json_files import write_whole
-from kgs.harmonics import SH_C0
+from kgs.geometry.harmonics import SH_C0
+from kgs.geometry.types import SH_SIZES
 from kgs.model import GaussianModel
 from kgs.ply import as_vector
-from kgs.types import SH_SIZES, check_kind
 
 __all__ = ["save_compressed_ply"]
 

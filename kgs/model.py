@@ -13,12 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from kgs._support.checks import check_tensor
 from kgs._support.errors import ArgumentError
 
 from .backends import choose
-from .geometry import log_spacing
-from .harmonics import SH_C0
-from .types import SH_SIZES, Gaussians, check_tensor
+from .geometry.harmonics import SH_C0
+from .geometry.spacing import log_spacing
+from .geometry.types import SH_SIZES, Gaussians
 
 INITIAL_OPACITY = 0.1
 PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh_dc", "sh_rest")

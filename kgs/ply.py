@@ -17,10 +17,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kgs._support.checks import check_kind
 from kgs._support.errors import ArgumentError, DataError, warn
 from kgs._support.json_files import write_whole
+from kgs.geometry.types import SH_SIZES
 from kgs.model import MAX_SH_DEGREE, GaussianModel
-from kgs.types import SH_SIZES, check_kind
 
 MAX_HEADER = 1 << 16  # bytes
 # NumPy's codes for the formats and types of PLY files.

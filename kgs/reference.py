@@ -14,7 +14,9 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from .types import Gaussians, RasterOptions, check_intrinsics, check_kind, check_tensor
+from kgs._support.checks import check_intrinsics, check_kind, check_tensor
+
+from .geometry.types import Gaussians, RasterOptions
 
 __all__ = ["Layers", "layers", "render"]
 

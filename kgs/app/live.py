@@ -11,8 +11,8 @@ import torch
 from kgs._support.torch_threads import torch_on_one_thread
 from kgs.fit.fit import Fit
 from kgs.fit.trainer import Trainer
+from kgs.geometry.types import Gaussians
 from kgs.model import GaussianModel
-from kgs.types import Gaussians
 
 from .live_server import LiveServer
 from .page.data import pack_float32

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from kgs.camera import Cameras
-from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
+from kgs.geometry.cameras import Cameras
+from kgs.geometry.types import Gaussians, ProjectedGaussians, RasterOptions
 
 
 class ActivationStage(Protocol):

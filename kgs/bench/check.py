@@ -12,9 +12,9 @@ from kgs._support.extras import installing
 from kgs._support.machine import check_device, versions
 from kgs.backends import Backend
 from kgs.backends.agreement import BOUND, disagreement
-from kgs.camera import move_camera
+from kgs.geometry.cameras import move_camera
+from kgs.geometry.types import RasterOptions
 from kgs.renderer import GaussianRenderer
-from kgs.types import RasterOptions
 
 from .scenes import cast, exact, gradients, layered_scene, relative_errors
 from .speed import SIZE, Cases

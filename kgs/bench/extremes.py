@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from kgs.camera import move_camera
+from kgs.geometry.cameras import move_camera
+from kgs.geometry.types import Gaussians
 from kgs.renderer import GaussianRenderer
-from kgs.types import Gaussians
 
 from .output import Row, markdown_table, write_results
 from .scenes import DTYPES, Scene, cast, centred_camera, exact, gradients, relative_errors

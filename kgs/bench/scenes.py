@@ -12,10 +12,10 @@ from torch import Tensor
 
 import kgs.reference
 from kgs._support.errors import DataError
-from kgs.camera import pinhole_cameras
-from kgs.harmonics import SH_C0
+from kgs.geometry.cameras import pinhole_cameras
+from kgs.geometry.harmonics import SH_C0
+from kgs.geometry.types import Gaussians
 from kgs.model import GaussianModel
-from kgs.types import Gaussians
 
 SYNTHETIC = "synthetic"  # the name of the built-in scene in a cell
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors")

@@ -16,12 +16,12 @@ from torch import Tensor
 from kgs._support.machine import check_device, peak_rss_mb
 from kgs.backends import resolve
 from kgs.backends.torch.binning import bin_to_tiles
-from kgs.camera import move_camera
 from kgs.fit.adam import Adam
+from kgs.geometry.cameras import move_camera
+from kgs.geometry.types import Gaussians
 from kgs.losses import photometric_loss, target_moments
 from kgs.renderer import GaussianRenderer
 from kgs.stages import composite, project
-from kgs.types import Gaussians
 
 from .output import Row, markdown_table, write_plot, write_results
 from .scenes import PARAMETERS, layered_scene

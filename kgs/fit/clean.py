@@ -18,8 +18,10 @@ from torch import Tensor
 
 from kgs._support.errors import ArgumentError
 from kgs._support.progress import ProgressBar, silent
-from kgs.camera import move_camera
-from kgs.geometry import NEIGHBOURS, camera_centers, log_spacing, nearest_pixels, project_points, typical_depths
+from kgs.geometry.cameras import move_camera
+from kgs.geometry.multiview import nearest_pixels, project_points, typical_depths
+from kgs.geometry.rigs import camera_centers
+from kgs.geometry.spacing import NEIGHBOURS, log_spacing
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 

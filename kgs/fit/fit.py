@@ -9,12 +9,12 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs._support.torch_threads import threads_beside
-from kgs.camera import move_camera
 from kgs.datasets.scene import Scene, Views
+from kgs.geometry.cameras import move_camera
+from kgs.geometry.types import RasterOptions
 from kgs.metrics.evaluate import mean_psnr
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer, blend
-from kgs.types import RasterOptions
 
 from .config import FitConfig
 from .decisions import Decisions

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from kgs.datasets.splits import select_evenly
-from kgs.geometry import nearest_pixels, project_points
+from kgs.geometry.multiview import nearest_pixels, project_points
 
 from .fit import Fit
 

@@ -6,11 +6,11 @@ from typing import Any, NamedTuple, Self
 
 import torch
 
+from kgs._support.checks import check_kind
 from kgs._support.machine import check_device
 from kgs.backends import resolve
 from kgs.datasets.scene import Scene
 from kgs.init_points.dense import FEW_VIEWS
-from kgs.types import check_kind
 
 from .config import FitConfig
 from .decisions import Decisions

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from kgs._support.errors import ArgumentError
 from kgs.datasets.scene import Scene
-from kgs.geometry import camera_centers, degrees_between
+from kgs.geometry.rigs import camera_centers, degrees_between
 
 from .adam import Adam
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from kgs.camera import move_camera
 from kgs.datasets.scene import Views
+from kgs.geometry.cameras import move_camera
+from kgs.geometry.types import RasterOptions
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
-from kgs.types import RasterOptions
 
 from .decisions import Decisions, PruningDecision
 from .fit import Fit

@@ -8,8 +8,8 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs._support.memory import empty
-from kgs.camera import move_camera
 from kgs.datasets.scene import Scene, Views
+from kgs.geometry.cameras import move_camera
 from kgs.losses import TargetMoments, target_moments
 
 _ABOVE_ONE = 1.0 + 2.0**-23  # the next float32: the gradient passes at 1, as it does in torch

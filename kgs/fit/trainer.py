@@ -19,15 +19,16 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from kgs._support.checks import check_kind
 from kgs._support.errors import ArgumentError, DataError, TrainingDiverged
 from kgs._support.torch_threads import threads_beside
 from kgs.backends import BACKENDS, resolve
 from kgs.datasets.scene import Scene, Views
+from kgs.geometry.types import Gaussians, RasterOptions, Rendering
 from kgs.init_points import InitialPoints
 from kgs.losses import photometric_loss
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
-from kgs.types import Gaussians, RasterOptions, Rendering, check_kind
 
 from .checkpoint import newest_checkpoint, previous, save_checkpoint
 from .config import FitConfig

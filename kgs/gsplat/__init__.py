@@ -7,12 +7,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kgs._support.checks import check_tensor
 from kgs._support.errors import ArgumentError
 from kgs.backends.base import CompositingCall
-from kgs.projection import normals
+from kgs.geometry.projection import normals
+from kgs.geometry.types import ProjectedGaussians, RasterOptions
 from kgs.renderer import blend
 from kgs.stages import composite_call, project
-from kgs.types import ProjectedGaussians, RasterOptions, check_tensor
 
 from .arguments import check_words, refuse
 from .meta import Pairs, absgrad_hook, joined
@@ -107,7 +108,7 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
         rasterize_mode: "classic", or "antialiased": see :class:`kgs.RasterOptions`.
         camera_model: "pinhole", "fisheye" (equidistant) or "ortho".
         covars: covariances in place of `quats` and `scales`, `(..., N, 3, 3)`: their upper triangles, see
-            :func:`kgs.covariance.covariance_factors`.
+            :func:`kgs.geometry.covariance.covariance_factors`.
         return_normals: `meta["normals"]` are the sums of w times normal, `(..., C, H, W, 3)`; the normal is the third
             local axis, turned towards the camera, in world axes.
         extra_signals: more features, `(..., N, E)` or `(..., C, N, E)`, rendered into `meta["render_extra_signals"]`.

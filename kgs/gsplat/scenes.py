@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from kornia.image import ImageSize
-from kornia.sensors.camera import CameraModel, CameraModelType
 from torch import Tensor
 
+from kgs._support.checks import check_tensor
 from kgs._support.errors import ArgumentError
-from kgs.camera import Cameras, PosedCamera, pinhole_cameras
-from kgs.covariance import covariance_factors
-from kgs.harmonics import evaluate_harmonics
-from kgs.projection import view_directions
-from kgs.types import SH_SIZES, Gaussians, ProjectedGaussians, check_tensor
+from kgs.geometry.camera_models import camera_model
+from kgs.geometry.cameras import Cameras, PosedCamera, pinhole_cameras
+from kgs.geometry.covariance import covariance_factors
+from kgs.geometry.harmonics import evaluate_harmonics
+from kgs.geometry.projection import view_directions
+from kgs.geometry.types import SH_SIZES, Gaussians, ProjectedGaussians
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,8 +184,6 @@ def _cameras(viewmats: Tensor, intrinsics: Tensor, size: tuple[int, int], lens: 
         return pinholes
     k = pinholes.intrinsics
     params = torch.stack([k[:, 0, 0], k[:, 1, 1], k[:, 0, 2], k[:, 1, 2]], 1)
-    kind = CameraModelType.ORTHOGRAPHIC
-    if lens == "fisheye":
-        kind = CameraModelType.KANNALA_BRANDT_K3
-        params = torch.nn.functional.pad(params, (0, 4))
-    return PosedCamera(CameraModel(ImageSize(height, width), kind, params), viewmats)
+    if lens == "ortho":
+        return PosedCamera(camera_model("orthographic", params, size), viewmats)
+    return PosedCamera(camera_model("kannala_brandt", torch.nn.functional.pad(params, (0, 4)), size), viewmats)

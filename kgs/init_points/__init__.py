@@ -7,13 +7,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from kgs._support.checks import check_kind
 from kgs._support.errors import ArgumentError, warn
 from kgs._support.machine import check_device
 from kgs._support.progress import ProgressBar, silent
 from kgs._support.shown import ShownByShapes
 from kgs.datasets.scene import Views
-from kgs.geometry import ViewGeometry
-from kgs.types import check_kind
+from kgs.geometry.multiview import ViewGeometry
 
 from .agreement import interpolate
 from .dense import MIN_POINTS, dense_points

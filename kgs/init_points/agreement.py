@@ -13,7 +13,7 @@ from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from kgs.geometry import ViewGeometry, nearest_pixels
+from kgs.geometry.multiview import ViewGeometry, nearest_pixels
 
 from .plane_sweep import DepthMap
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from kgs._support.progress import ProgressBar, silent
 from kgs.datasets.scene import Views
-from kgs.geometry import ViewGeometry
+from kgs.geometry.multiview import ViewGeometry
 
 from .agreement import average_depths, consistent_pixels
 from .patches import PatchColors, patch_colors

@@ -6,7 +6,9 @@ from torch import Tensor
 
 from kgs._support.progress import ProgressBar, silent
 from kgs.datasets.scene import Views
-from kgs.geometry import ViewGeometry, log_spacing, meeting_point
+from kgs.geometry.multiview import ViewGeometry
+from kgs.geometry.rigs import meeting_point
+from kgs.geometry.spacing import log_spacing
 
 from .tracks import find_tracks
 from .triangulate import TrackedPoints, triangulate_certain

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, normalize
 
 from kgs.datasets.scene import Views
-from kgs.geometry import ViewGeometry
+from kgs.geometry.multiview import ViewGeometry
 
 from .agreement import agreeing_views, interpolate
 from .plane_sweep import DepthMap

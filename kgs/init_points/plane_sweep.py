@@ -14,7 +14,7 @@ from torch import Tensor
 from kgs._support.errors import ArgumentError
 from kgs._support.progress import ProgressBar, silent
 from kgs.datasets.scene import Views
-from kgs.geometry import ViewGeometry
+from kgs.geometry.multiview import ViewGeometry
 
 from .sweep_costs import sweep_costs
 

@@ -10,7 +10,7 @@ import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
-from kgs.geometry import ViewGeometry
+from kgs.geometry.multiview import ViewGeometry
 
 from .tracks import Tracks
 

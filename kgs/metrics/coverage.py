@@ -12,7 +12,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs.datasets.scene import Scene
-from kgs.geometry import nearest_pixels, project_points, unproject
+from kgs.geometry.multiview import nearest_pixels, project_points, unproject
 
 MIN_VIEWS = 2  # training views that show a point
 OCCLUDED = 1.05  # a point is hidden from a view if it is farther than this times the view's depth there

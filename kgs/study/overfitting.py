@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from kgs._support.errors import ArgumentError
-from kgs.camera import move_camera
 from kgs.datasets.scene import Views
 from kgs.fit.trainer import Trainer
-from kgs.geometry import camera_centers
+from kgs.geometry.cameras import move_camera
+from kgs.geometry.rigs import camera_centers
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 

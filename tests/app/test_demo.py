@@ -20,7 +20,7 @@ from kgs.app.page.fit_page import MAX_PICTURES
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.splits import select_evenly
 from kgs.fit.config import DROP
-from kgs.geometry import camera_centers
+from kgs.geometry.rigs import camera_centers
 
 TINY = ("--size", "40")
 PHOTO_SIZE = 335, 504  # height and width of the photos of the package

@@ -26,7 +26,7 @@ from kgs.fit.config import DEMO
 from kgs.fit.plan import make_plan
 from kgs.fit.run import choose_points
 from kgs.fit.trainer import Trainer
-from kgs.types import RasterOptions
+from kgs.geometry.types import RasterOptions
 
 SIZE = (150, 200)  # height, width
 BACKGROUND = torch.tensor([0.2, 0.5, 0.1])

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 import kgs
 from kgs.compressed_ply import save_compressed_ply
-from kgs.harmonics import SH_C0
+from kgs.geometry.harmonics import SH_C0
 
 LEVELS = np.array([2047, 1023, 2047])
 ANGLE = 0.3  # degrees

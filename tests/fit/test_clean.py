@@ -11,7 +11,7 @@ from kgs import GaussianModel, pinhole_cameras
 from kgs.datasets.scene import Scene, Views, pinholes
 from kgs.fit import Fit
 from kgs.fit.clean import TOLERANCE, check_left, clean, find_strays
-from kgs.types import RasterOptions
+from kgs.geometry.types import RasterOptions
 
 SIZE = (30, 40)
 SIDE = 40  # Gaussians along a side of the wall

@@ -14,7 +14,7 @@ from kgs.fit.haze import FADE, WINDOW, darkest, veils
 from kgs.fit.plan import make_plan, make_schedule
 from kgs.fit.run import choose_points
 from kgs.fit.trainer import Trainer
-from kgs.types import RasterOptions
+from kgs.geometry.types import RasterOptions
 
 
 @pytest.fixture(scope="module")

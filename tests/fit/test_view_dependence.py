@@ -13,8 +13,8 @@ from kgs.fit import FitConfig, InitialPoints, view_dependence
 from kgs.fit.plan import make_plan, with_step_defaults
 from kgs.fit.run import choose_points, decide
 from kgs.fit.view_dependence import MIN_GAIN, harmonics_kernel, possible_gain, without_exposure
-from kgs.geometry import ViewGeometry
-from kgs.harmonics import harmonics_basis
+from kgs.geometry.harmonics import harmonics_basis
+from kgs.geometry.multiview import ViewGeometry
 from kgs.init_points.patches import MIN_PATCHES, PatchColors
 
 VIEWS = 8

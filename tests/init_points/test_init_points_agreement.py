@@ -5,7 +5,7 @@ import pytest
 import torch
 from init_point_scenes import cameras
 
-from kgs.geometry import ViewGeometry
+from kgs.geometry.multiview import ViewGeometry
 from kgs.init_points import agreement
 from kgs.init_points.agreement import average_depths, consistent_pixels
 from kgs.init_points.plane_sweep import DepthMap

@@ -10,7 +10,8 @@ from yard import yard_depths, yard_from_above, yard_scene
 
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
-from kgs.geometry import ViewGeometry, camera_centers, nearest_pixels, project_points
+from kgs.geometry.multiview import ViewGeometry, nearest_pixels, project_points
+from kgs.geometry.rigs import camera_centers
 from kgs.init_points import dense, initial_points
 from kgs.init_points.dense import PER_SKY, SKY, _one_per_cell, dense_points, small_enough
 from kgs.init_points.depth_limits import MIN_SIFT, sweep_range

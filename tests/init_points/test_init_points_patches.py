@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from init_point_scenes import as_views, cameras
 
-from kgs.geometry import ViewGeometry
+from kgs.geometry.multiview import ViewGeometry
 from kgs.init_points.patches import MIN_AGREED, patch_colors
 from kgs.init_points.plane_sweep import DepthMap
 

@@ -7,7 +7,7 @@ import torch
 from init_point_scenes import HEIGHT, WIDTH, as_views, cameras, exact_tracks, focal_length, texture
 from kornia.geometry.camera import PinholeCamera
 
-from kgs.geometry import ViewGeometry
+from kgs.geometry.multiview import ViewGeometry
 from kgs.init_points.tracks import Tracks, find_tracks
 from kgs.init_points.triangulate import triangulate, triangulate_certain
 

@@ -22,7 +22,7 @@ from kgs.datasets import Views, load_scene, synthetic_scene
 from kgs.densify import Densifier
 from kgs.fit import FitConfig, InitialPoints, Trainer, fit_scene, initial_points
 from kgs.fit.plan import make_plan
-from kgs.geometry import camera_extent
+from kgs.geometry.rigs import camera_extent
 from kgs.losses import photometric_loss
 
 UPRIGHT = torch.eye(3)

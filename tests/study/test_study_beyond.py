@@ -11,7 +11,7 @@ from init_point_scenes import as_views
 from kgs.datasets import synthetic_scene
 from kgs.datasets.scene import Scene, pinholes
 from kgs.datasets.synthetic import room, synthetic_depths, views_beyond
-from kgs.geometry import camera_centers
+from kgs.geometry.rigs import camera_centers
 from kgs.study import beyond
 from kgs.study.beyond import Target, beyond_cells, from_the_middle, measure_target, room_targets
 from kgs.study.beyond_report import write_beyond

@@ -14,7 +14,7 @@ from kgs.bench.scenes import check_scenes
 from kgs.datasets import load_scene
 from kgs.fit.config import FitConfig
 from kgs.fit.run import fit_scene
-from kgs.geometry import ViewGeometry, nearest_pixels
+from kgs.geometry.multiview import ViewGeometry, nearest_pixels
 from kgs.init_points.agreement import consistent_pixels
 from kgs.init_points.dense import agreed_depths
 

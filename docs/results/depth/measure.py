@@ -14,7 +14,7 @@ from kgs.bench.scenes import check_scenes
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths
-from kgs.geometry import ViewGeometry
+from kgs.geometry.multiview import ViewGeometry
 from kgs.init_points.agreement import confirming_views, consistent_pixels
 from kgs.init_points.dense import agreed_depths, small_enough
 from kgs.init_points.depth_limits import certain_points, sweep_range

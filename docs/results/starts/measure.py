@@ -16,7 +16,8 @@ from kgs.bench.scenes import check_scenes
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths
-from kgs.geometry import camera_centers, project_points
+from kgs.geometry.multiview import project_points
+from kgs.geometry.rigs import camera_centers
 from kgs.init_points import initial_points
 
 ALL_POINTS, RANDOM_POINTS = 10**6, 10_000

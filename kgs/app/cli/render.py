@@ -54,7 +54,7 @@ def render(
 
     from kgs.app.files.cameras import as_taken
     from kgs.app.files.publishing import check_free, replacing
-    from kgs.camera import move_camera
+    from kgs.geometry.cameras import move_camera
     from kgs.renderer import GaussianRenderer
 
     is_transparent = background == "transparent"

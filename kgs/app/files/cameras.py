@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kgs.datasets.scene import Views, pinholes
-from kgs.geometry import common_up
+from kgs.geometry.rigs import common_up
 
 _OUTSIDE = 0.01  # share of the Gaussians that the bounds leave out at each side of each axis
 _DISTANT = 10.0  # times the median distance from the middle: Gaussians beyond are a sky, outside the bounds

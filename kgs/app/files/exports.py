@@ -16,7 +16,7 @@ from kgs.app.files.preview import write_preview
 from kgs.compressed_ply import save_compressed_ply
 from kgs.datasets.scene import pinholes
 from kgs.fit.fit import Fit
-from kgs.geometry import typical_depths
+from kgs.geometry.multiview import typical_depths
 from kgs.ply import float32_moves
 
 

@@ -15,7 +15,8 @@ from torch.nn.functional import normalize
 
 from kgs._support.progress import ProgressBar, silent
 from kgs.datasets.scene import Views, pinholes
-from kgs.geometry import camera_centers, meeting_point, typical_depths
+from kgs.geometry.multiview import typical_depths
+from kgs.geometry.rigs import camera_centers, meeting_point
 
 from .cameras import upright
 from .encoders import encode

@@ -16,13 +16,13 @@ from kornia.geometry.conversions import rotation_matrix_to_quaternion
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kgs._support.checks import check_kind
 from kgs._support.errors import ArgumentError
 from kgs._support.json_files import write_whole
 from kgs._support.version import __version__
-from kgs.harmonics import SH_C0
+from kgs.geometry.harmonics import SH_C0
 from kgs.model import GaussianModel
 from kgs.ply import as_vector
-from kgs.types import check_kind
 
 _EXTENSION = "KHR_gaussian_splatting"
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}  # types of accessors, by the count of numbers per Gaussian

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kgs._support.json_files import write_whole
 from kgs.datasets.scene import Views, pinholes
-from kgs.geometry import camera_centers
+from kgs.geometry.rigs import camera_centers
 
 from .images import eight_bits
 

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from kgs.app.files.encoders import RATE
 from kgs.app.files.film import FRAMES, resample_by_speed
-from kgs.geometry import camera_centers, common_up, typical_depths
+from kgs.geometry.multiview import typical_depths
+from kgs.geometry.rigs import camera_centers, common_up
 
 Array = NDArray[np.float64]
 _PYRAMID = 0.3  # depth of a pyramid, as a share of the median distance between neighbouring cameras

@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kgs._support.errors import ArgumentError, quantity
-from kgs.geometry import camera_centers
-from kgs.harmonics import SH_C0
-from kgs.projection import finite_gaussians
-from kgs.types import SH_SIZES, Gaussians, RasterOptions
+from kgs.geometry.harmonics import SH_C0
+from kgs.geometry.projection import finite_gaussians
+from kgs.geometry.rigs import camera_centers
+from kgs.geometry.types import SH_SIZES, Gaussians, RasterOptions
 
 from .cameras import Array, lenses, visible_points
 

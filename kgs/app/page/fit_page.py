@@ -25,7 +25,7 @@ from kgs.fit.decisions import Decisions
 from kgs.fit.fit import Fit
 from kgs.fit.measures import used_init
 from kgs.fit.pruning import contributions, left_out
-from kgs.types import Gaussians
+from kgs.geometry.types import Gaussians
 
 from .content import PageContent, PagePhotos, PageSplat, PageText
 from .figures import psnr_of_views

@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from kgs._support.errors import PhotosRefused
-from kgs.geometry import degrees_between
+from kgs.geometry.rigs import degrees_between
 
 from .map import MIN_MATCHES, Cameras, PairGeometry
 

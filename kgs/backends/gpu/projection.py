@@ -10,8 +10,9 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs.backends.torch.projection import project as project_in_torch
-from kgs.camera import MARGIN, Cameras, whole_frame
-from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
+from kgs.geometry.cameras import Cameras
+from kgs.geometry.lenses import MARGIN, whole_frame
+from kgs.geometry.types import Gaussians, ProjectedGaussians, RasterOptions
 
 from . import entry_counts
 from .binning_kernels import count_all_entries, sum_counts

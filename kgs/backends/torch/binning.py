@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from kgs.backends.row_slices import row_slices
-from kgs.covariance import variances
-from kgs.projection import cut_squared
-from kgs.types import ProjectedGaussians, RasterOptions
+from kgs.geometry.covariance import variances
+from kgs.geometry.projection import cut_squared
+from kgs.geometry.types import ProjectedGaussians, RasterOptions
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,8 @@ from torch import Tensor
 
 from kgs.backends.base import CompositingCall, CompositingInputs, Compositor, Images
 from kgs.backends.row_slices import MAX_BYTES
-from kgs.covariance import footprint_table, moment_gradients
-from kgs.types import RasterOptions
+from kgs.geometry.covariance import footprint_table, moment_gradients
+from kgs.geometry.types import RasterOptions
 
 from .binning import TileCoverage, TileLists
 
@@ -186,7 +186,7 @@ class Wanted:
 class Columns:
     """A column of numbers for each Gaussian of a depth slice."""
 
-    table: Tensor  # (7, n + 1), see `kgs.covariance.footprint_table`
+    table: Tensor  # (7, n + 1), see `kgs.geometry.covariance.footprint_table`
     features: Tensor  # (F, n + 1)
     depths: Tensor | None  # (n + 1,), where the median depth is wanted
 
