@@ -4,7 +4,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,7 +26,7 @@ from kgs.app.files.results_folder import (
     is_finished,
     step_of,
 )
-from kgs.app.page.fit_page import PAGE, write_own_page
+from kgs.app.page.fit_page import write_own_page
 from kgs.datasets.scene import Scene
 from kgs.fit.checkpoint import save_checkpoint
 from kgs.fit.config import FitConfig, min_side
@@ -41,7 +41,6 @@ from kgs.ply import save_ply
 
 from .console import each, progress, say
 from .files.exports import write_exports
-from .live import LivePage
 from .scene_request import SceneRequest
 from .stages import Stages
 
@@ -66,7 +65,6 @@ def fit_folder(
     resume: bool = False,
     lpips: Lpips | None = None,
     held_out: dict[str, Any] | None = None,
-    live: bool = False,
     say: Callable[[str], None] = say,
     stages: Stages | None = None,
 ) -> Published:
@@ -84,7 +82,6 @@ def fit_folder(
         resume: continue the fit in `out/unfinished`, or if there is none that in `out`.
         lpips: the perceptual metric, or None to leave it out.
         held_out: the measures of :func:`kgs.app.held_out.measure_held_out`, for metrics.json and the page.
-        live: show the splat during the fit on a page on this machine, see :class:`kgs.app.live.LivePage`.
         say: called with each line for the user.
         stages: names the stages as they begin.
 
@@ -105,7 +102,7 @@ def fit_folder(
     _check_size(scene, config, lpips)
     names = png_names([*scene.train.names, *scene.test.names])
     _check_out(out, scene)
-    with locked(out), ExitStack() as until_the_end:
+    with locked(out):
         check_fit_files(out, resume, [f"{_TEST}/{names[view]}" for view in scene.test.names])
         work = out / UNFINISHED
         trainer = _trainer(scene, config, plan, out, resume, say, stages)
@@ -119,8 +116,7 @@ def fit_folder(
             with replacing(work, "fit") as new:
                 write_json(new / "config.json", settings)
             stages.begin("fit")
-            page = until_the_end.enter_context(_live_page(trainer, request, out, say)) if live else None
-            fit, stopped_by = train(trainer, work / CHECKPOINT, live=page)
+            fit, stopped_by = train(trainer, work / CHECKPOINT)
             is_trained = True
             with replacing(work, "fit", keep_on_error=True) as new:
                 stages.begin("film")
@@ -150,9 +146,6 @@ def fit_folder(
                 discard(work, "photos")  # of another fit: those of this one are published with it
             publish(work, out)
         notes.say_new()
-        if page is not None:
-            how = f"was stopped at step {trainer.step}" if stopped_by else "is done"
-            page.end = f"The fit {how}. Its page: {(folder / PAGE).resolve()}"
     return Published(fit, stopped_by, folder)
 
 
@@ -199,19 +192,6 @@ def _trainer(
     memory = expected_memory(scene, gaussian_limit(plan.config, len(points.points)))
     say(f"initial points: {len(points.points)} ({points.kind}); the fit takes up to {memory / 2**30:.1f} GiB of memory")
     return Trainer(scene, plan, points)
-
-
-def _live_page(
-    trainer: Trainer, request: SceneRequest, out: Path, say: Callable[[str], None]
-) -> AbstractContextManager[LivePage | None]:
-    """The page that shows the fit at work, and a line that says where; None if the system gives no port."""
-    try:
-        page = LivePage(trainer, request.title_of(out), request.roll)
-    except OSError as error:
-        say(f"there is no live page: {error}")
-        return nullcontext()
-    say(f"open {page.url} in a browser on this machine: the splat as it grows, until the fit ends")
-    return page
 
 
 class _Notes:
@@ -264,14 +244,11 @@ def _write_results(
     return fit.annotated(metrics=metrics, notes=(*fit.notes, *notes))
 
 
-def train(
-    trainer: Trainer, checkpoint: Path | None, title: str = "fit", live: LivePage | None = None
-) -> tuple[Fit, int]:
+def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> tuple[Fit, int]:
     """Train to the end with a progress line, and :func:`prune`; save checkpoints each minute and at evaluations.
 
-    `live` shows the splat. SIGINT (Ctrl-C), SIGTERM and SIGHUP end the training after the current step. Returns the fit
-    and the number of that signal, or 0. If a checkpoint cannot be written (a full disk), a note says so the first time,
-    and training goes on.
+    SIGINT (Ctrl-C), SIGTERM and SIGHUP end the training after the current step. Returns the fit and the number of that
+    signal, or 0. If a checkpoint cannot be written (a full disk), a note says so the first time, and training goes on.
     """
     saved = time.monotonic()
     has_failed = False
@@ -294,14 +271,10 @@ def train(
             advance(f"loss={loss:.4f}, {len(trainer.model)} Gaussians")
             if trainer.step in schedule.evaluate or time.monotonic() - saved > _SAVE_SECONDS:
                 save()
-            if live is not None:
-                live.after_step(trainer)
             return bool(stopped)
 
         fit = prune(trainer.fit(after_step))
         save(fit.part)
-    if live is not None:
-        live.after_training(fit)
     return fit, stopped[0] if stopped else 0
 
 

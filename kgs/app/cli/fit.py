@@ -25,7 +25,7 @@ from .words import options_in
 
 # The short help shows these entries of FitConfig, and all other options of the command but the rare ones.
 _OF_CONFIG = ("steps", "drop", "refine_poses", "seed", "device")
-_RARE = ("downscale", "background", "lpips_weights", "mask_mode", "roll", "frames", "title", "live", "config")
+_RARE = ("downscale", "background", "lpips_weights", "mask_mode", "roll", "frames", "title", "config")
 
 
 def first_config(words: list[str]) -> FitConfig:
@@ -67,7 +67,6 @@ def fit(
     no_photos: Flag = False,
     roll: float = 0.0,
     lpips_weights: IfGiven[Path] = None,
-    live: Flag = False,
     open_page: Open = False,
     config: Annotated[FitConfig, tyro.conf.arg(name="")],
 ) -> int:
@@ -104,7 +103,6 @@ def fit(
         no_photos: leave the photos out of the page.
         roll: turn page and film clockwise by so many degrees.
         lpips_weights: folder with the weights of VGG16 and LPIPS (npz). Unless given: LPIPS is not measured.
-        live: show the splat as it grows on a page on this machine, until the fit ends; a line says its address.
         open_page: open the page in a browser when the fit is done.
         config: every number of the fit.
     """
@@ -223,7 +221,7 @@ def fit(
                 say("stopped in the measurement: the fit was not begun", sys.stderr)
                 return 128 + stopped_by
         published = fit_folder(
-            loaded, config, out, request, resume=resume, lpips=lpips, held_out=held_out, live=live, stages=stages
+            loaded, config, out, request, resume=resume, lpips=lpips, held_out=held_out, stages=stages
         )
     metrics = published.fit.metrics
     say(as_text(metrics))

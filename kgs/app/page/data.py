@@ -129,19 +129,6 @@ def pack(
     return packed._replace(left_out=", ".join(words))
 
 
-def pack_float32(gaussians: Gaussians) -> Packed:
-    """Gaussians for a viewer on the same machine: ten times as fast as :func:`pack`, in three times the bytes or more.
-
-    Invisible Gaussians are left out, and the order is kept. `columns` of the layout has the names of the columns only;
-    of each in turn, the content has a float32 (little-endian) for each Gaussian.
-    """
-    values, rows = _visible(gaussians)
-    degree = SH_SIZES.index(values["colors"].shape[1])
-    columns = dict(_numbers(values, degree))
-    content = b"".join(column.astype("<f4").tobytes() for column in columns.values())
-    return Packed({"count": len(rows), "degree": degree, "columns": list(columns)}, content)
-
-
 def _visible(gaussians: Gaussians) -> tuple[dict[str, NDArray[Any]], NDArray[np.intp]]:
     """The values of the visible Gaussians, with harmonics that a viewer can draw, and which rows these are."""
     values = {name: value.detach().cpu().numpy() for name, value in vars(gaussians).items()}

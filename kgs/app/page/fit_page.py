@@ -25,12 +25,11 @@ from kgs.fit.decisions import Decisions
 from kgs.fit.fit import Fit
 from kgs.fit.measures import used_init
 from kgs.fit.pruning import contributions, left_out
-from kgs.geometry.types import Gaussians
 
 from .content import PageContent, PagePhotos, PageSplat, PageText
 from .figures import psnr_of_views
 from .pictures import Picture, in_strip
-from .write import live_html, write_page
+from .write import write_page
 
 PAGE = "index.html"
 MAX_PICTURES = 6  # photos that are shown beside their renders
@@ -160,22 +159,6 @@ def write_own_page(
         photos=request.photos,
         roll=request.roll,
     )
-
-
-def live_page(fit: Fit, gaussians: Gaussians, title: str, roll: float = 0.0) -> bytes:
-    """The HTML of the page that shows a fit at work, see :func:`kgs.app.page.write.live_html`.
-
-    Args:
-        fit: as far as it is.
-        gaussians: a copy of some of its Gaussians.
-        title: of the page.
-        roll: degrees by which all pictures are turned clockwise.
-    """
-    scene = fit.scene
-    views = scene.test if len(scene.test) else scene.train
-    photographed = views.select(spread(len(views), MAX_PICTURES))
-    splat = PageSplat(gaussians, _ground(photographed, scene.background), fit.options)
-    return live_html(PageContent(splat, _photos(scene, ("training", "test"), roll), PageText(title)))
 
 
 def _photos(scene: Scene, words: tuple[str, str], roll: float) -> PagePhotos:

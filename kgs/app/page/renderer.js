@@ -13,13 +13,10 @@ async function unzipped(base64) {
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-// A splat from its layout and base64-encoded content.
+// A splat as the content of two textures, from its layout and base64-encoded content.
 async function decodeSplat(layout, base64) {
-  return splatOf(layout, decodeColumns(layout, await unzipped(base64)));
-}
-
-// The splat as the content of two textures, from its columns.
-function splatOf({ count, degree }, columns) {
+  const { count, degree } = layout;
+  const columns = decodeColumns(layout, await unzipped(base64));
   const coefficients = (degree + 1) ** 2;
   return {
     count,

@@ -336,14 +336,6 @@ class Viewer {
     return { ...eye, nearPlane: nearPlane + share * (farNearPlane - nearPlane) };
   }
 
-  // Shows another splat of the scene from where the eye is.
-  take(splat) {
-    this.renderer.take(splat);
-    this.usualCoverage = null;
-    this.roamedTo = null;
-    this.requestDraw();
-  }
-
   // Draws with the next frame of the browser, once.
   requestDraw() {
     if (this.redrawRequested) return;
@@ -565,4 +557,4 @@ async function openViewer() {
   }));
 }
 
-const opened = openViewer();
+openViewer();

@@ -1,7 +1,6 @@
 """Writes the page: one HTML file that contains everything it needs and loads nothing from the network."""
 
 import base64
-import gzip
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -29,7 +28,7 @@ _LAYOUT_BYTES = 8192  # reserved for the layout of the splat and for sizes in th
 _NUMBERS = ("One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine", "Ten", "Eleven", "Twelve")
 _LISTED = 24  # photos whose file names are under Details
 _STYLES = ("style.css", "viewer.css")
-_SCRIPTS = ("renderer.js", "ruler.js", "viewer.js")
+_SCRIPTS = ("renderer.js", "ruler.js", "viewer.js", "pictures.js")
 _SHADERS = ("splat.vert.glsl", "splat.frag.glsl", "screen.vert.glsl", "screen.frag.glsl")
 
 
@@ -67,15 +66,6 @@ def write_page(path: Path, content: PageContent, max_bytes: int = MAX_BYTES) -> 
     return packed.left_out
 
 
-def live_html(content: PageContent) -> bytes:
-    """A page with the viewer alone, without a splat: it asks the server that it came from, see kgs/app/live_server.py.
-
-    Cameras and lenses are those of `content`, whose Gaussians only say where the scene is.
-    """
-    no_splat = Packed({"count": 0, "degree": 0, "columns": []}, gzip.compress(b""))
-    return _Page(content, "live.html.jinja", "live.js").html(no_splat)
-
-
 class _Page:
     """Makes the HTML of a page, first without its splat, which is packed into what the rest leaves.
 
@@ -84,11 +74,9 @@ class _Page:
 
     Args:
         content: what the page shows.
-        template: a file of this folder.
-        script: the file of this folder that follows the scripts of the viewer.
     """
 
-    def __init__(self, content: PageContent, template: str = "page.html.jinja", script: str = "pictures.js") -> None:
+    def __init__(self, content: PageContent) -> None:
         import jinja2
         from markupsafe import Markup
 
@@ -106,14 +94,14 @@ class _Page:
         self._context = _context(content, self._scene)
         code = {
             "style": "".join([*map(_file, _STYLES), *_sizes(self._scene, self._context["strip"])]),
-            "script": "".join(map(_file, (*_SCRIPTS, script))),
+            "script": "".join(map(_file, _SCRIPTS)),
         }
         for kind, text in code.items():
             digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
             self._context |= {kind: Markup(text), f"{kind}_hash": f"sha256-{digest}"}
         loader = jinja2.PackageLoader("kgs.app.page", ".")
         environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True)
-        self._template = environment.get_template(template)
+        self._template = environment.get_template("page.html.jinja")
 
     def html(self, packed: Packed | None = None, page_bytes: int = 0) -> bytes:
         """The whole file.
