@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from kgs._support.errors import DataError, listed
+from kgs.geometry.cameras import pinhole_cameras
 
 from .border import with_border
 from .folders import CAMERAS_REPORT
@@ -25,7 +26,7 @@ from .images import rectification, remap, resize
 from .mask_files import find_mask_files
 from .masks import as_masks
 from .options import BACKGROUNDS, check_options
-from .scene import Scene, Views, pinholes
+from .scene import Scene, Views
 from .source import SceneSource
 from .splits import TEST_EVERY, select_evenly, split_between_ends, split_by_name
 
@@ -320,7 +321,7 @@ def _views(
         mask = torch.stack([alphas[j].get(i, opaque) for i in range(count)]) if alphas[j] else None
         every = opaque[0] > 0
         rows = torch.stack([valid[j].get(i, every) for i in range(count)]) if valid[j] else None
-        cameras = pinholes(intrinsics[j], extrinsics, scale.size)
+        cameras = pinhole_cameras(extrinsics, intrinsics[j], *scale.size[::-1])
         kinds = tuple(turned) if any(turned) else None
         views.append(Views(cameras, images[j], names, mask, valid_mask=rows, turned=kinds))
     return views

@@ -12,7 +12,7 @@ from kgs._support.extras import installing
 from kgs._support.machine import check_device, versions
 from kgs.backends import Backend
 from kgs.backends.agreement import BOUND, disagreement
-from kgs.geometry.cameras import move_camera
+from kgs.geometry.cameras import to
 from kgs.geometry.types import RasterOptions
 from kgs.renderer import GaussianRenderer
 
@@ -119,7 +119,7 @@ def _off_by(backend: str, device: torch.device) -> float:
     image, slopes = exact(scene, RasterOptions.near_plane)
     gaussians, camera = cast(scene, torch.float32)
     renderer = GaussianRenderer(backend=backend, alpha_threshold=0.0, transmittance_stop=0.0)
-    drawn = renderer(gaussians.to(device), move_camera(camera, device)).image.cpu()
+    drawn = renderer(gaussians.to(device), to(camera, device)).image.cpu()
     errors = relative_errors(gradients(drawn, gaussians), slopes)
     return max(float((drawn - image).detach().abs().max()), float(errors.max()))
 

@@ -1,7 +1,12 @@
-"""Cameras: Kornia's pinhole cameras, made and checked, and its camera models with their poses."""
+"""Kornia's pinhole cameras: made, selected, moved, resized, turned, projected with; and its lens models with poses.
 
+`kgs.cameras` has the public names. A `PinholeCamera` can be neither indexed nor moved to a device: only this file makes
+one, and changes one by making another.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, SupportsIndex
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -97,27 +102,146 @@ def pinhole_cameras(
         raise ArgumentError(f"Ks: expected shape ({count}, 3, 3), ({count}, 4, 4) or one matrix, got {shape}")
     if pixel_centers not in ("integer", "half"):
         raise ArgumentError(f'pixel_centers: expected "integer" or "half", got {pixel_centers!r}')
-    for name, size in (("width", width), ("height", height)):
-        if not (isinstance(size, int | np.integer) and size >= 1):
-            raise ArgumentError(f"{name}: expected an integer >= 1, got {size!r}")
+    for name, side in (("width", width), ("height", height)):
+        if not (isinstance(side, int | np.integer) and side >= 1):
+            raise ArgumentError(f"{name}: expected an integer >= 1, got {side!r}")
     traced = torch.compiler.is_compiling()  # then `project` checks
     if not traced:
         check_intrinsics("Ks", Ks)
     full = torch.eye(4, dtype=Ks.dtype, device=Ks.device).repeat(count, 1, 1)
     full[:, :2, :3] = Ks[..., :2, :3]
     full[:, :2, 2] -= 0.5 if pixel_centers == "half" else 0.0
-    heights = torch.full((count,), int(height), device=poses.device)
-    widths = torch.full((count,), int(width), device=poses.device)
-    cameras = PinholeCamera(full, poses, heights, widths)
+    size = int(height), int(width)
+    cameras = _with_size(full, poses, size)
     if not traced:
-        _remember(cameras, (int(height), int(width)))
+        _remember(cameras, size)
     return cameras
 
 
-def move_camera(camera: PinholeCamera, device: torch.device) -> PinholeCamera:
-    """The same cameras on another device."""
-    tensors = (camera.intrinsics, camera.extrinsics, camera.height, camera.width)
-    return PinholeCamera(*(tensor.to(device) for tensor in tensors))
+def select(cameras: PinholeCamera, index: SupportsIndex | Sequence[SupportsIndex] | slice | Tensor) -> PinholeCamera:
+    """Some of the cameras as a batch: one, those of several positions or of a slice, or those of a mask.
+
+    Args:
+        cameras: C cameras.
+        index: an integer, integers, a slice, or a mask `(C,)`; on any device.
+
+    Raises:
+        TypeError: positions are not integers.
+        IndexError: there is no such camera.
+    """
+    count = len(cameras.extrinsics)
+    if isinstance(index, slice):
+        index = range(count)[index]
+    rows = index.cpu() if isinstance(index, Tensor) else torch.as_tensor(index, device="cpu")
+    if rows.dtype == torch.bool and rows.shape == (count,):
+        rows = rows.nonzero()
+    if rows.numel() and (rows.is_floating_point() or rows.is_complex() or rows.dtype == torch.bool):
+        raise TypeError(f"index: expected integers, got {rows.dtype}")
+    rows = rows.reshape(-1).long()
+    if not bool(((rows >= -count) & (rows < count)).all()):
+        raise IndexError(f"index: expected whole numbers below {count}, the number of cameras, got {rows.tolist()}")
+    rows = rows.to(cameras.extrinsics.device)
+    return PinholeCamera(*(values[rows] for values in _tensors(cameras)))
+
+
+def joined(*parts: PinholeCamera) -> PinholeCamera:
+    """The cameras of several batches in one, in this order."""
+    return PinholeCamera(*map(torch.cat, zip(*map(_tensors, parts), strict=True)))
+
+
+def to(
+    cameras: PinholeCamera, device: torch.device | str | None = None, dtype: torch.dtype | None = None
+) -> PinholeCamera:
+    """The cameras on another device, or with matrices of another dtype; None leaves either as it is."""
+    intrinsics, extrinsics = (x.to(device=device, dtype=dtype) for x in (cameras.intrinsics, cameras.extrinsics))
+    return PinholeCamera(intrinsics, extrinsics, cameras.height.to(device=device), cameras.width.to(device=device))
+
+
+def posed(cameras: PinholeCamera, extrinsics: Tensor) -> PinholeCamera:
+    """The same lenses at other poses: world-to-camera `(C, 4, 4)`, OpenCV axes."""
+    return PinholeCamera(cameras.intrinsics, extrinsics, cameras.height, cameras.width)
+
+
+def resized(
+    cameras: PinholeCamera,
+    scale: float | tuple[float, float],
+    size: tuple[int, int],
+    corner: tuple[float, float] = (0.0, 0.0),
+) -> PinholeCamera:
+    """The cameras of images that are scaled, and then cut to one size; differentiable.
+
+    Convention:
+        Integer pixel centres: a principal point c moves to (c + 1/2) s - 1/2, less the corner.
+
+    Args:
+        cameras: C cameras.
+        scale: the factor of the images' width and height, or one of each.
+        size: height and width of the result in pixels.
+        corner: where its first pixel lies in the scaled image, (x, y) in pixels.
+    """
+    scales = scale if isinstance(scale, tuple) else (scale, scale)
+    matrices = cameras.intrinsics.clone()
+    for axis, (factor, first) in enumerate(zip(scales, corner, strict=True)):
+        matrices[:, axis, :3] *= factor
+        matrices[:, axis, 2] += (factor - 1) / 2 - first
+    return _with_size(matrices, cameras.extrinsics, size)
+
+
+def turned(cameras: PinholeCamera, quarters: int = 1) -> PinholeCamera:
+    """The cameras of images that are turned clockwise by quarter turns; they see the same; differentiable.
+
+    Convention:
+        Integer pixel centres: a pixel (x, y) of an image of height H moves to (H - 1 - y, x). The camera's x axis is up
+        before, its y axis to the right.
+
+    Args:
+        cameras: C cameras, of any sizes.
+        quarters: how many, counterclockwise where negative.
+    """
+    height = cameras.height
+    width = cameras.width
+    matrices = cameras.intrinsics
+    poses = cameras.extrinsics
+    signs = matrices.new_tensor([[1.0, -1.0], [-1.0, 1.0]])
+    for _ in range(quarters % 4):
+        before = matrices
+        matrices = before.clone()
+        matrices[:, :2, :2] = before[:, :2, :2].flip(1, 2) * signs
+        matrices[:, 0, 2] = height.to(before) - 1 - before[:, 1, 2]
+        matrices[:, 1, 2] = before[:, 0, 2]
+        poses = torch.cat([-poses[:, 1:2], poses[:, :1], poses[:, 2:]], 1)
+        height, width = width, height
+    return PinholeCamera(matrices, poses, height, width)
+
+
+def project(cameras: PinholeCamera, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Pixels and depths of P points in C cameras, exactly: float64 on the CPU, whatever the cameras are.
+
+    Convention:
+        Integer pixel centres; depth is z in the camera's frame (OpenCV axes), in world units.
+
+    Args:
+        cameras: C cameras, of any sizes.
+        points: in world coordinates, `(P, 3)`.
+
+    Returns:
+        Pixels (x, y), `(P, C, 2)`, which mean nothing at a depth <= 0, and depths, `(P, C)`.
+    """
+    poses = cameras.extrinsics.double().cpu()
+    matrices = cameras.intrinsics[:, :3, :3].double().cpu().contiguous()
+    local = torch.einsum("vij,pj->pvi", poses[:, :3, :3], points.double().cpu()) + poses[:, :3, 3]
+    image = torch.einsum("vij,pvj->pvi", matrices, local)
+    return image[..., :2] / image[..., 2:], local[..., 2]
+
+
+def _with_size(intrinsics: Tensor, extrinsics: Tensor, size: tuple[int, int]) -> PinholeCamera:
+    """Cameras from `(C, 4, 4)` matrices and one (height, width) for all of them."""
+    sizes = (torch.full((len(extrinsics),), side, device=extrinsics.device) for side in size)
+    return PinholeCamera(intrinsics, extrinsics, *sizes)
+
+
+def _tensors(cameras: PinholeCamera) -> tuple[Tensor, ...]:
+    return cameras.intrinsics, cameras.extrinsics, cameras.height, cameras.width
 
 
 class _CheckedSize(NamedTuple):
@@ -138,6 +262,8 @@ def image_size(cameras: Cameras) -> tuple[int, int]:
     """
     if not isinstance(cameras, PinholeCamera):
         return _model_size(cameras)
+    if not len(cameras.extrinsics):
+        raise ArgumentError("cameras: expected at least one camera, got none")
     checked = _checked_sizes.get(cameras)
     if checked is not None and checked.versions == _versions(cameras):
         return checked.size

@@ -6,8 +6,6 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from kgs.geometry.cameras import pinhole_cameras
-from kgs.geometry.multiview import ViewGeometry, project_points, unproject
 from kgs.geometry.rigs import camera_centers, camera_extent, common_up, degrees_between, meeting_point
 
 
@@ -31,23 +29,6 @@ def turned(count, seed=0):
 
 
 CENTRES = torch.tensor([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [2.0, 3.0, 0.0]], dtype=torch.float64)
-
-
-def test_points_project_to_kornias_pixels_and_back():
-    k = torch.tensor([[50.0, 0.5, 31.0], [0.0, 60.0, 22.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    cameras = pinhole_cameras(rig(CENTRES, turned(3)), k, width=64, height=48)
-    geometry = ViewGeometry.of(cameras)
-    points = 5 * torch.randn(40, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    pixels, depths = geometry.project(points)
-    expected = cameras.project(points[None].expand(3, -1, -1)).transpose(0, 1)
-    front = depths > 0
-    torch.testing.assert_close(pixels[front], expected[front])
-    for view in range(3):
-        back = geometry.unproject(pixels[:, view], depths[:, view], torch.full((40,), view))
-        torch.testing.assert_close(back, points)
-    assert torch.equal(project_points(points, cameras)[0], pixels)
-    first = (pixels[:, 0], depths[:, 0], torch.zeros(40, dtype=torch.int64))
-    assert torch.equal(unproject(*first, cameras), geometry.unproject(*first))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

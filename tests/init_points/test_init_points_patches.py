@@ -4,14 +4,14 @@ import numpy as np
 import torch
 from init_point_scenes import as_views, cameras
 
-from kgs.geometry.multiview import ViewGeometry
+from kgs.geometry.cameras import to
 from kgs.init_points.patches import MIN_AGREED, patch_colors
 from kgs.init_points.plane_sweep import DepthMap
 
 WIDTH, HEIGHT, DEPTH = 40, 32, 4.0
 CENTERS = np.array([[-0.2, 0.0, 0.0], [0.0, 0.1, 0.0], [0.2, 0.0, 0.0], [0.4, 0.1, 0.0]])
 POSED = cameras(CENTERS, turn=0.05, size=(WIDTH, HEIGHT))
-GEOMETRY = ViewGeometry.of(POSED)
+GEOMETRY = to(POSED, "cpu", torch.float64)
 EVERYWHERE = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
 PIXELS = torch.cartesian_prod(torch.arange(WIDTH), torch.arange(HEIGHT))
 TINTS = torch.tensor([0.0, 0.1, 0.2, 0.3])  # each camera sees the wall in another colour

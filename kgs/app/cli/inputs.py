@@ -67,7 +67,7 @@ def _check_seen(ply: Path, fit: "Fit") -> None:
     """Refuse a splat that no camera sees; name the cameras that see nothing of it."""
     import torch
 
-    from kgs.geometry.cameras import move_camera
+    from kgs.geometry.cameras import to
     from kgs.stages import project
 
     views = fit.scene.train
@@ -75,7 +75,7 @@ def _check_seen(ply: Path, fit: "Fit") -> None:
     with torch.no_grad():
         gaussians = fit.model()
     for i, name in enumerate(views.names):
-        camera = move_camera(views.camera(i), fit.device)
+        camera = to(views.camera(i), fit.device)
         if not len(project(gaussians, camera, options=fit.options, colors=False, backend=fit.backend)):
             blind.append(name)
     if len(blind) == len(views):

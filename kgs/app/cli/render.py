@@ -54,7 +54,7 @@ def render(
 
     from kgs.app.files.cameras import as_taken
     from kgs.app.files.publishing import check_free, replacing
-    from kgs.geometry.cameras import move_camera
+    from kgs.geometry.cameras import to
     from kgs.renderer import GaussianRenderer
 
     is_transparent = background == "transparent"
@@ -67,7 +67,7 @@ def render(
     outputs = ("image", "alpha") if is_transparent else ("image",)
     with replacing(out, "renders") as new, torch.no_grad():
         for i, name in each(list(enumerate(scene.train.names)), "pictures", "view"):
-            rendering = renderer(fit.model(), move_camera(scene.train.camera(i), torch_device), color, outputs)
+            rendering = renderer(fit.model(), to(scene.train.camera(i), torch_device), color, outputs)
             image = rendering.image
             if is_transparent:  # PNG's colours are not multiplied by alpha
                 image = torch.cat([image / rendering.alpha.clamp_min(1e-6), rendering.alpha], 1)
