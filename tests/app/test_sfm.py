@@ -23,8 +23,8 @@ from photo_folders import (
     write_planes,
 )
 
-from kgs.app.sfm import map as mapping
 from kgs.app.sfm import pose_photos
+from kgs.app.sfm.map import Solver
 from kgs.app.sfm.write import leveling, write_model
 from kgs.datasets import load_scene
 from kgs.errors import PhotosRefused
@@ -269,13 +269,13 @@ def test_a_zoomed_photo_gets_a_lens_of_its_own(tmp_path):
 
 
 def test_a_solver_whose_first_pair_leads_nowhere_registers_all_photos(tmp_path, monkeypatch):
-    map_once = mapping._run_mapper
+    map_once = Solver._run_mapper
 
-    def run_mapper(pycolmap, database, images, work, options, start=""):
-        fails = database.stem == "second" and options.init_image_id1 < 0
-        return None if fails else map_once(pycolmap, database, images, work, options, start)
+    def run_mapper(solver, options, start=""):
+        fails = solver.database.stem == "second" and options.init_image_id1 < 0
+        return None if fails else map_once(solver, options, start)
 
-    monkeypatch.setattr(mapping, "_run_mapper", run_mapper)
+    monkeypatch.setattr(Solver, "_run_mapper", run_mapper)
     report = pose_photos(write_planes(tmp_path / "photos", small_planes()), tmp_path / "out")
     assert len(report["photos"]) == 3
     assert report["left_out"] == {}

@@ -460,7 +460,7 @@ def test_new_cameras_wait_beside_the_fit_of_the_former_ones(folder, found):
 NOT_FOUND = "kgs: stopped: the cameras were not found yet, and nothing was written\n"
 
 
-@pytest.mark.parametrize("stage", ["pose.write_images", "agree.write_matches"])
+@pytest.mark.parametrize("stage", ["pose.write_images", "accept.write_matches"])
 @pytest.mark.parametrize(
     ("error", "code", "said"),
     [(OSError(28, "No space left on device"), 1, "No space left on device"), (KeyboardInterrupt(), 130, NOT_FOUND)],

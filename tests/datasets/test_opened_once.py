@@ -15,7 +15,7 @@ from photo_folders import planes, write_photos
 from tiny_scenes import write_blender, write_colmap, write_llff, write_nerfstudio
 
 from kgs._support.errors import DataError
-from kgs.app.sfm import agree, pose_photos
+from kgs.app.sfm import accept, pose_photos
 from kgs.datasets import image_file, load_scene
 
 _watched: list[Counter[str]] = []
@@ -80,7 +80,7 @@ def test_unposed_photos(
     def stop(*_: object) -> None:
         raise DataError(folder, "", "stopped behind the decoding")
 
-    monkeypatch.setattr(agree, "write_matches", stop)
+    monkeypatch.setattr(accept, "write_matches", stop)
     opened.clear()
     with pytest.raises(DataError, match="stopped"):
         pose_photos(folder, tmp_path / "out")

@@ -1,7 +1,7 @@
-"""Finds the cameras of unposed photos. `pose` runs the parts: find, read, keypoints, match, map, gates, write.
+"""Finds the cameras of unposed photos. `pose` runs the parts: find, read, match, map, accept, write.
 
 The input is a folder of photos as a phone wrote them, the output a scene that kgs and other programs read. Two solvers
-have to agree, and gates refuse cameras that cannot be trusted: see :mod:`kgs.app.sfm.gates`.
+have to agree, and cameras that cannot be trusted are refused: see :mod:`kgs.app.sfm.accept`.
 """
 
 from typing import TYPE_CHECKING

@@ -10,26 +10,23 @@ import signal
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import combinations
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import mode
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from .pycolmap_processes import check_space
 
-MIN_MATCHES = 30  # verified matches of a pair that overlaps; of noise up to 27 were verified
-_MAX_ERROR = 1.5  # largest reprojection error, in pixels
+MAX_ERROR = 1.5  # largest reprojection error, in pixels
 _FIRST_PAIR_DEGREES = 2.0  # least angle between the first two photos; COLMAP's 16 fails on photos that face one way
 _FIRST_PAIR_DEGREES_AGAIN = 0.2  # the same in a second attempt, if the first one registers no pair
 _ROUNDS = 5  # at most, each of registering photos with the lens held and then adjusting it
 _CONVERGED = 0.01  # relative change of the focal length, and change of the distortion, at which rounds end
 _USUAL_DISTORTION = 0.05  # radial; larger ones have to explain much of the errors
 _DISTORTION_GAIN = 0.1  # share of the squared errors that a larger distortion has to explain
-_ONE_WAY = 0.9  # share of the matches that move away from where a camera goes, or towards it
 _WRONG_FOCAL = 1.25  # factor by which the focal length is made wrong to see whether points still fit
 
 
@@ -49,12 +46,7 @@ class Cameras(NamedTuple):
         return mode(self.focals.values())
 
 
-class PairGeometry(NamedTuple):
-    """What the matches of two photos say about depth."""
-
-    shift: float  # median distance that they move between the photos, pixels
-    planar: float  # share that one homography explains: 1 where the camera only turned, or saw one plane
-    forward: bool = False  # whether each photo shows where the other was taken: the camera moved along its view
+NO_CAMERAS = Cameras({}, {}, {}, {}, None, 0.0)  # of a solver that registered no photo
 
 
 @contextmanager
@@ -74,123 +66,107 @@ def quiet_pycolmap() -> Iterator[Any]:
         pycolmap.logging.minloglevel = level
 
 
-def verified(database: Path, names: Mapping[str, str]) -> dict[tuple[str, str], int]:
-    """How many matches of every pair are verified, by the names that `names` gives images of a database."""
-    with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database) as file:
-        images = {image.image_id: names[image.name] for image in file.read_all_images() if image.name in names}
-        pairs = list(combinations(sorted(images), 2))
-        return {(images[i], images[j]): len(_inliers(file, i, j)) for i, j in pairs}
+@dataclass(frozen=True)
+class Solver:
+    """COLMAP's mapper with the matches of one database."""
 
+    database: Path  # with verified matches, and a first guess of each lens
+    images: Path  # the folder of the photos
+    work: Path  # a folder for what the mapper writes
+    seed: int  # of its random choices
 
-def pair_geometries(database: Path, names: Mapping[str, str]) -> dict[tuple[str, str], PairGeometry]:
-    """What the verified matches of each overlapping pair say about depth, by the names of the pair in `names`."""
-    geometries = {}
-    with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database) as file:
-        images = {image.image_id: names[image.name] for image in file.read_all_images()}
-        keypoints = {i: file.read_keypoints(i)[:, :2] for i in images}
-        lens = file.read_all_cameras()[0]
-        for i, j in combinations(sorted(images), 2):
-            rows = _inliers(file, i, j)
-            if len(rows) >= MIN_MATCHES:
-                first = keypoints[i][rows[:, 0]]
-                second = keypoints[j][rows[:, 1]]
-                _, planar = cv2.findHomography(first, second, cv2.RANSAC, _MAX_ERROR)
-                shift = float(np.median(np.linalg.norm(first - second, axis=1)))
-                share = 0.0 if planar is None else float(np.mean(planar))
-                geometries[images[i], images[j]] = PairGeometry(shift, share, _is_forward(first, second, lens))
-    return geometries
+    def solve(
+        self,
+        names: Mapping[str, str],
+        focals: Sequence[float] = (),
+        *,
+        attempt: int = 0,
+        first_pair: tuple[str, str] | None = None,
+        start: Cameras | None = None,
+        at_least: int = 0,
+    ) -> Cameras:
+        """Cameras and points of as many photos as can be registered; none if no pair can be.
 
+        Lenses are held while photos are registered, because two photos do not determine them, and adjusted to all of
+        them after that. This is repeated with the lenses that came out until they no longer change.
 
-def _is_forward(first: NDArray[np.float64], second: NDArray[np.float64], lens: Any) -> bool:
-    """Whether both photos show the centre of the other's camera, and nearly all matches `(M, 2)` move away from it.
+        Args:
+            names: the names of the photos to register, by those of the images in the database.
+            focals: the focal length of each lens in pixels if they are known; (): they are adjusted.
+            attempt: added to the seed.
+            first_pair: the images in the database that are registered first; None: the mapper chooses.
+            start: cameras of other matches that are there before any photo is registered. Their points are
+                triangulated again, from the matches of the database, and then the cameras are adjusted to these.
+            at_least: how many photos have to be registered; where the first round registers fewer, there are none.
+        """
+        import pycolmap
 
-    The centres are seen at the epipoles, of a matrix that few or wrong matches leave open: hence the second condition.
-    """
-    fundamental, _ = cv2.findFundamentalMat(first, second, cv2.FM_RANSAC, _MAX_ERROR, 0.999)
-    if fundamental is None or fundamental.shape != (3, 3):
-        return False
-    homogeneous = np.array([np.linalg.svd(matrix)[2][-1] for matrix in (fundamental, fundamental.T)])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        epipoles = homogeneous[:, :2] / homogeneous[:, 2:]
-    if not bool(((epipoles > 0) & (epipoles < (lens.width, lens.height))).all()):
-        return False
-    away = np.linalg.norm(second - epipoles[1], axis=1) > np.linalg.norm(first - epipoles[0], axis=1)
-    return bool(abs(away.mean() - 0.5) > _ONE_WAY - 0.5)
-
-
-def solve(
-    database: Path,
-    images: Path,
-    work: Path,
-    seed: int,
-    names: Mapping[str, str],
-    focals: Sequence[float] = (),
-    *,
-    first_pair: tuple[str, str] | None = None,
-    start: Cameras | None = None,
-    min_registered: int = 0,
-) -> Cameras | None:
-    """Cameras and points from verified matches, of as many photos as can be registered; None if no pair can be.
-
-    Lenses are held while photos are registered, because two photos do not determine them, and adjusted to all of them
-    after that. This is repeated with the lenses that came out until they no longer change.
-
-    Args:
-        database: with verified matches, and a first guess of each lens.
-        images: the folder of the photos.
-        work: a folder for what the mapper writes.
-        seed: of its random choices.
-        names: the names of the photos to register, by those of the images in the database.
-        focals: the focal length of each lens in pixels if they are known; (): they are adjusted.
-        first_pair: the images in the database that are registered first; None: the mapper chooses.
-        start: cameras of other matches that are there before any photo is registered. Their points are triangulated
-            again, from the matches of the database, and then the cameras are adjusted to these.
-        min_registered: how many photos have to be; where the first round registers fewer, the result is None.
-    """
-    best = None
-    error = 0.0
-    is_held = len(focals) > 0
-    with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database) as file:
-        guesses = file.read_all_cameras()
-        lenses = {lens.camera_id: lens for lens in file.read_all_cameras()}
-        for camera_id, focal in zip(sorted(lenses), focals, strict=is_held):
-            lenses[camera_id].focal_length = focal
-        ids = {image.name: image.image_id for image in file.read_all_images()}
-        options = _mapper_options(pycolmap, list(names), seed)
-        if first_pair:
-            options.init_image_id1, options.init_image_id2 = (ids[image] for image in first_pair)
-            options.init_num_trials = 1
-        for _ in range(_ROUNDS if start is None else 1):
-            for lens in lenses.values():
+        best = None
+        error = 0.0
+        is_held = len(focals) > 0
+        with pycolmap.Database.open(self.database) as file:
+            guesses = file.read_all_cameras()
+            lenses = {lens.camera_id: lens for lens in file.read_all_cameras()}
+            for camera_id, focal in zip(sorted(lenses), focals, strict=is_held):
+                lenses[camera_id].focal_length = focal
+            options = _mapper_options(list(names), self.seed + attempt)
+            if first_pair:
+                ids = {image.name: image.image_id for image in file.read_all_images()}
+                options.init_image_id1, options.init_image_id2 = (ids[image] for image in first_pair)
+                options.init_num_trials = 1
+            for _ in range(_ROUNDS if start is None else 1):
+                for lens in lenses.values():
+                    file.update_camera(lens)
+                if start is None:
+                    scene = self._map(options, free=not is_held)
+                else:
+                    scene = self._map_from(_reconstruction(file, start, names), options)
+                if scene is None or scene.num_reg_images() < at_least or (best is not None and _is_worse(scene, best)):
+                    break
+                best, error = _adjust(scene, is_held)
+                changes = [_change(lenses[camera_id], lens) for camera_id, lens in best.cameras.items()]
+                for camera_id, lens in best.cameras.items():
+                    lenses[camera_id].params = lens.params
+                if max(changes) < _CONVERGED:
+                    break
+            for lens in guesses:
                 file.update_camera(lens)
-            if start is None:
-                scene = _map(pycolmap, database, images, work, options, not is_held)
-            else:
-                scene = _map_from(pycolmap, database, images, work, options, _started(file, start, names))
-            if (
-                scene is None
-                or scene.num_reg_images() < min_registered
-                or (best is not None and _is_worse(scene, best))
-            ):
-                break
-            best, error = _adjust(scene, is_held)
-            changes = [_change(lenses[camera_id], lens) for camera_id, lens in best.cameras.items()]
-            for camera_id, lens in best.cameras.items():
-                lenses[camera_id].params = lens.params
-            if max(changes) < _CONVERGED:
-                break
-        for lens in guesses:
-            file.update_camera(lens)
-    if best is None:
+        if best is None:
+            return NO_CAMERAS
+        return cameras_of(best, names, math.inf if is_held else _focal_rise(best, error))
+
+    def _map(self, options: Any, free: bool) -> Any:
+        """The reconstruction of most photos with the lenses of the database; None if no pair can be registered.
+
+        If `free`, the second attempt adjusts focal lengths while it registers photos.
+        """
+        for degrees, refine in ((_FIRST_PAIR_DEGREES, False), (_FIRST_PAIR_DEGREES_AGAIN, free)):
+            options.mapper.init_min_tri_angle = degrees
+            options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = refine
+            if (scene := self._run_mapper(options)) is not None:
+                return scene
         return None
-    return cameras_of(best, names, math.inf if is_held else _focal_rise(best, error))
 
+    def _map_from(self, start: Any, options: Any) -> Any:
+        """The reconstruction of the photos whose cameras are known, and of those that its points then register."""
+        import pycolmap
 
-def _change(before: Any, after: Any) -> float:
-    """The relative change of a lens's focal length, or that of its distortion if this is larger."""
-    focal = abs(after.params[0] / before.params[0] - 1)
-    distortion = abs(after.params[3] - before.params[3])
-    return float(max(focal, distortion))
+        known = self.work / "start"
+        known.mkdir(parents=True, exist_ok=True)
+        points = pycolmap.triangulate_points(start, self.database, self.images, known, options=options)
+        points.write_binary(known)
+        return self._run_mapper(options, known)
+
+    def _run_mapper(self, options: Any, start: str | Path = "") -> Any:
+        """The reconstruction with most registered photos; None if there is none. The mapper goes on from `start`."""
+        import pycolmap
+
+        try:
+            scenes = pycolmap.incremental_mapping(self.database, self.images, self.work, options, start)
+        except (RuntimeError, ValueError):  # the mapper gives up
+            check_space(self.database.parent)
+            return None
+        return max(scenes.values(), key=lambda scene: scene.num_reg_images(), default=None)
 
 
 def cameras_of(reconstruction: Any, names: Mapping[str, str], focal_rise: float) -> Cameras:
@@ -208,8 +184,10 @@ def cameras_of(reconstruction: Any, names: Mapping[str, str], focal_rise: float)
     )
 
 
-def _mapper_options(pycolmap: Any, images: list[str], seed: int) -> Any:
+def _mapper_options(images: list[str], seed: int) -> Any:
     """The settings with which the mapper registers these images of a database."""
+    import pycolmap
+
     options = pycolmap.IncrementalPipelineOptions()
     options.image_names = images
     options.num_threads = options.mapper.num_threads = 1
@@ -222,62 +200,36 @@ def _mapper_options(pycolmap: Any, images: list[str], seed: int) -> Any:
     options.min_num_matches = 10
     options.mapper.init_min_num_inliers = 20
     options.mapper.abs_pose_min_num_inliers = 12
-    options.mapper.filter_max_reproj_error = _MAX_ERROR
-    options.triangulation.complete_max_reproj_error = options.triangulation.merge_max_reproj_error = _MAX_ERROR
+    options.mapper.filter_max_reproj_error = MAX_ERROR
+    options.triangulation.complete_max_reproj_error = options.triangulation.merge_max_reproj_error = MAX_ERROR
     options.mapper.init_max_error = 2.0
     options.mapper.abs_pose_max_error = 4.0
     options.triangulation.ignore_two_view_tracks = False  # of three photos, most points are seen by two
     return options
 
 
-def _map(pycolmap: Any, database: Path, images: Path, work: Path, options: Any, free: bool) -> Any:
-    """The reconstruction of most photos with the lenses of the database; None if no pair can be registered.
-
-    If `free`, the second attempt adjusts focal lengths while it registers photos.
-    """
-    options.mapper.init_min_tri_angle = _FIRST_PAIR_DEGREES
-    options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = False
-    scene = _run_mapper(pycolmap, database, images, work, options)
-    if scene is None:
-        options.mapper.init_min_tri_angle = _FIRST_PAIR_DEGREES_AGAIN
-        options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = free
-        scene = _run_mapper(pycolmap, database, images, work, options)
-    return scene
-
-
-def _map_from(pycolmap: Any, database: Path, images: Path, work: Path, options: Any, start: Any) -> Any:
-    """The reconstruction of the photos whose cameras are known, and of those that its points then register."""
-    known = work / "start"
-    known.mkdir(parents=True, exist_ok=True)
-    points = pycolmap.triangulate_points(start, database, images, known, options=options)
-    points.write_binary(known)
-    return _run_mapper(pycolmap, database, images, work, options, known)
-
-
-def _started(file: Any, cameras: Cameras, names: Mapping[str, str]) -> Any:
+def _reconstruction(file: Any, cameras: Cameras, names: Mapping[str, str]) -> Any:
     """A reconstruction with these cameras and the keypoints of a database, without points."""
-    with quiet_pycolmap() as pycolmap:
-        scene = pycolmap.Reconstruction()
-        images = {image.name: image for image in file.read_all_images()}
-        for lens in cameras.reconstruction.cameras.values():
-            scene.add_camera_with_trivial_rig(lens)
-        for image in cameras.reconstruction.images.values():
-            if image.has_pose and names.get(image.name) in cameras.rotations:
-                image_id = images[image.name].image_id
-                keypoints = file.read_keypoints(image_id)[:, :2]
-                new = pycolmap.Image(name=image.name, keypoints=keypoints, camera_id=image.camera_id, image_id=image_id)
-                scene.add_image_with_trivial_frame(new, image.cam_from_world())
+    import pycolmap
+
+    scene = pycolmap.Reconstruction()
+    ids = {image.name: image.image_id for image in file.read_all_images()}
+    for lens in cameras.reconstruction.cameras.values():
+        scene.add_camera_with_trivial_rig(lens)
+    for image in cameras.reconstruction.images.values():
+        if image.has_pose and names.get(image.name) in cameras.rotations:
+            image_id = ids[image.name]
+            keypoints = file.read_keypoints(image_id)[:, :2]
+            new = pycolmap.Image(name=image.name, keypoints=keypoints, camera_id=image.camera_id, image_id=image_id)
+            scene.add_image_with_trivial_frame(new, image.cam_from_world())
     return scene
 
 
-def _run_mapper(pycolmap: Any, database: Path, images: Path, work: Path, options: Any, start: str | Path = "") -> Any:
-    """The reconstruction with most registered photos; None if there is none. The mapper goes on from `start`."""
-    try:
-        scenes = pycolmap.incremental_mapping(database, images, work, options, start)
-    except (RuntimeError, ValueError):  # the mapper gives up
-        check_space(database.parent)
-        return None
-    return max(scenes.values(), key=lambda scene: scene.num_reg_images(), default=None)
+def _change(before: Any, after: Any) -> float:
+    """The relative change of a lens's focal length, or that of its distortion if this is larger."""
+    focal = abs(after.params[0] / before.params[0] - 1)
+    distortion = abs(after.params[3] - before.params[3])
+    return float(max(focal, distortion))
 
 
 def _is_worse(scene: Any, best: Any) -> bool:
@@ -317,21 +269,22 @@ def _bundle_adjust(
         factor: by which focal lengths are multiplied first.
         distortion: at which the radial distortions are held instead.
     """
+    import pycolmap
+
     scene = copy.deepcopy(reconstruction)
-    with quiet_pycolmap() as pycolmap:
-        options = pycolmap.BundleAdjustmentOptions()
-        options.print_summary = False
-        options.ceres.solver_options.num_threads = 1
-        options.refine_focal_length = not hold_focal
-        options.refine_extra_params = not hold_distortion and distortion is None
-        config = pycolmap.BundleAdjustmentConfig()
-        for lens in scene.cameras.values():
-            focal, x, y, own = lens.params
-            lens.params = [factor * focal, x, y, own if distortion is None else distortion]
-        for image in scene.reg_image_ids():
-            config.add_image(image)
-        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-        done = pycolmap.create_default_ceres_bundle_adjuster(options, config, scene).solve()
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.ceres.solver_options.num_threads = 1
+    options.refine_focal_length = not hold_focal
+    options.refine_extra_params = not hold_distortion and distortion is None
+    config = pycolmap.BundleAdjustmentConfig()
+    for lens in scene.cameras.values():
+        focal, x, y, own = lens.params
+        lens.params = [factor * focal, x, y, own if distortion is None else distortion]
+    for image in scene.reg_image_ids():
+        config.add_image(image)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    done: Any = pycolmap.create_default_ceres_bundle_adjuster(options, config, scene).solve()
     return scene, float(done.ceres_summary.final_cost) if done.num_residuals else 0.0
 
 
@@ -346,10 +299,3 @@ def _focal_rise(reconstruction: Any, error: float) -> float:
         for factor in (_WRONG_FOCAL, 1 / _WRONG_FOCAL)
     )
     return wrong / max(error, np.finfo(np.float64).tiny) - 1
-
-
-def _inliers(file: Any, i: int, j: int) -> NDArray[np.int64]:
-    """Indices of the keypoints of two images in their verified matches, `(M, 2)`."""
-    if not file.exists_two_view_geometry(i, j):
-        return np.zeros((0, 2), np.int64)
-    return np.asarray(file.read_two_view_geometry(i, j).inlier_matches, np.int64)

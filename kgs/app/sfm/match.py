@@ -16,6 +16,7 @@ from kgs._support.progress import ProgressBar
 from kgs.init_points.keypoints import root_sift
 
 from .read import Photo
+from .write import write_images
 
 SMALL = 1000  # pixels of the longer side; SIFT sees smaller photos at twice their size
 MIN_KEYPOINTS = 4096  # of one photo
@@ -55,11 +56,13 @@ def write_matches(database: Path, photos: list[Photo], names: list[str], bar: Pr
         names: their names in the database.
         bar: wraps the loops to show their progress, see :mod:`kgs._support.progress`.
     """
+    import pycolmap
+
     # The cost of matching grows with the squares of both counts, so many photos get fewer keypoints each.
     max_count = min(MAX_KEYPOINTS, max(MIN_KEYPOINTS, ALL_KEYPOINTS // len(photos)))
     keypoints = [find_keypoints(photo, max_count) for photo in bar(photos, "keypoints", "photo")]
     area = photos[0].size[::-1]
-    with _open(database) as file:
+    with pycolmap.Database.open(database) as file:
         ids = _write_photos(file, photos, names)
         for image_id, of_photo in zip(ids, keypoints, strict=True):
             file.write_keypoints(image_id, of_photo.pixels.numpy())
@@ -96,12 +99,6 @@ def _match(first: PhotoKeypoints, second: PhotoKeypoints, area: tuple[int, ...])
         hw2=area,
     )
     return torch.stack([rows[pairs[:, 0]], columns[pairs[:, 1]]], dim=1)
-
-
-def _open(database: Path) -> Any:
-    import pycolmap
-
-    return pycolmap.Database.open(database)
 
 
 def exif_focal(photos: list[Photo]) -> float | None:
@@ -152,3 +149,19 @@ def _write_photos(file: Any, photos: list[Photo], names: list[str]) -> list[int]
         file.write_frame(frame)
         ids.append(image.image_id)
     return ids
+
+
+def colmap_matching(photos: list[Photo], images: Path, masks: Path, work: Path, names: list[str]) -> dict[str, Any]:
+    """What the step `write_colmap_matches` takes: folders, names of each lens's photos, and the lens if it is known.
+
+    Photos with alpha are written again over black: COLMAP would find keypoints in what alpha hides.
+    """
+    if not all(photo.is_opaque for photo in photos):
+        images = work / "opaque"
+        images.mkdir()
+        write_images(images, photos, names, opaque=True)
+    lenses = []
+    for number, lens in enumerate(lenses_of(photos)):
+        of_lens = [name for photo, name in zip(photos, names, strict=True) if photo.lens == number]
+        lenses.append((of_lens, lens.params_to_string() if lens.has_prior_focal_length else None))
+    return {"images": str(images), "masks": str(masks) if masks.is_dir() else None, "lenses": lenses}

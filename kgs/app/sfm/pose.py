@@ -25,14 +25,12 @@ from kgs.app.files.publishing import UNFINISHED, complete, discard, replacing
 from kgs.app.files.results_folder import check_no_fit
 from kgs.datasets.image_file import color_notes
 
-from .agree import agreed_cameras, say_left_out
+from .accept import FOCAL_RANGE, MAX_DEGREES, MAX_RATIO, MIN_POINTS, MIN_RISE, accepted_cameras, say_left_out
 from .find import find_photos, find_video
-from .gates import FOCAL_RANGE, MAX_DEGREES, MAX_RATIO, MIN_POINTS, MIN_RISE
-from .leave_out import unlike_others
 from .map import Cameras, quiet_pycolmap
 from .match import exif_focal
 from .pycolmap_processes import check_space
-from .read import FILM_DIAGONAL, OpenPhoto, Photo, blurred, open_photos, read_photos
+from .read import FILM_DIAGONAL, OpenPhoto, Photo, blurred, open_photos, read_photos, unlike_others
 from .video import take_frames
 from .workspace import IMAGES, MASKS, MODEL, REPORT, check_workspace, is_reusable
 from .write import level_and_scale, upright, write_images, write_masks, write_model
@@ -162,7 +160,7 @@ def find_cameras(
     images = new / IMAGES
     for path in (images, work):
         path.mkdir(parents=True)
-    with _one_thread(), report_full_disk(new):
+    with quiet_pycolmap(), _one_thread(), report_full_disk(new):
         photos = read_photos(opened, bar)
         for photo in photos:
             if photo.whole:
@@ -184,14 +182,14 @@ def find_cameras(
             write_images(folders[0], photos, list(png.values()))
             write_masks(folders[1], photos, list(png.values()))
         lap("photos")
-        found = agreed_cameras(photos, *folders, work, photo_names, seed, bar, lap, say)
-        for name in found.left_out:
+        found = accepted_cameras(photos, *folders, work, photo_names, seed, bar, lap, say)
+        for name in found.rejected:
             (images / png[name]).unlink()
             (new / MASKS / f"{png[name]}.png").unlink(missing_ok=True)
         if found.held:
             focals = " and ".join(f"{focal:.0f}" for focal in found.held)
             say(f"the photos do not tell the focal length; the Exif says {focals} pixels, and that is taken")
-        photos = [photo for photo in photos if photo.name not in found.left_out]
+        photos = [photo for photo in photos if photo.name not in found.rejected]
         chosen = upright(found.cameras, turned, photo_names)
         level_and_scale(chosen)
         write_model(new / MODEL, chosen, images)
@@ -213,7 +211,7 @@ def find_cameras(
             }
             for photo in photos
         },
-        "left_out": unlike | found.left_out,
+        "left_out": unlike | found.rejected,
         "matches": [[*pair, count] for pair, count in found.pairs.items()],
         "points": chosen.reconstruction.num_points3D(),
         "reprojection_error_px": error,

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kgs._support.errors import DataError
+from kgs._support.errors import DataError, PhotosRefused
 from kgs._support.progress import ProgressBar
 from kgs.datasets import folders, image_file
 from kgs.datasets.image_file import Image, ImageFile, turn
@@ -24,7 +24,7 @@ from kgs.datasets.images import Intrinsics, reduce
 from kgs.datasets.mask_files import find_mask_files
 from kgs.datasets.masks import Mask, as_masks
 
-from .find import CONVERT
+from .find import CONVERT, MIN_PHOTOS, listed_files
 
 LONGEST = 1600  # pixels of the longer side, for matching and for what is written
 FILM_DIAGONAL = math.hypot(36, 24)  # mm
@@ -338,6 +338,58 @@ def by_shape(photos: list[OpenPhoto]) -> dict[str, list[OpenPhoto]]:
         known = (size for size in groups if _same_shape(size, photo.size))
         groups[next(known, photo.size)].append(photo)
     return {f"{width}x{height}": group for (width, height), group in groups.items()}
+
+
+def unlike_others(photos: list[OpenPhoto]) -> dict[str, str]:
+    """Photos that are copies, or of another shape than most without a focal length in their Exif, and why.
+
+    Raises:
+        PhotosRefused: most photos are panoramas, there are fewer than `MIN_PHOTOS` without copies, or no shape is that
+            of most.
+    """
+    folder = photos[0].path.parent
+    panoramas = [photo.path for photo in photos if photo.is_panorama]
+    if 2 * len(panoramas) > len(photos):
+        line = f'ffmpeg -i "{panoramas[0].name}" -vf v360=e:rectilinear:h_fov=90:v_fov=67:yaw=0 yaw_0.jpg'
+        reason = f"is a panorama, not a picture of a lens. Cut some from it: `{line}`, the same for other angles"
+        raise PhotosRefused(panoramas[0], "", reason)
+    first = {photo.sha256: photo.name for photo in reversed(photos)}
+    copied = {photo.name: first[photo.sha256] for photo in photos if first[photo.sha256] != photo.name}
+    left = {name: f"it is the same photo as {other}" for name, other in copied.items()}
+    if copied and len(photos) - len(left) < MIN_PHOTOS:
+        name, other = next(iter(copied.items()))
+        advice = "two copies show no depth. Remove one, and take another photo from a step to the side"
+        reason = f"is the same photo as {other}: {advice}"
+        raise PhotosRefused(photos[0].path.with_name(name), "", reason)
+    photos = [photo for photo in photos if photo.name not in left]
+    shapes = by_shape(photos)
+    if (usual := _usual(shapes)) is None:
+        groups = _listed(shapes)
+        reason = f"expected photos of one shape, got {len(shapes)} ({groups}). Keep one group in the folder"
+        raise PhotosRefused(folder, "", f"{reason}. Cropped photos do not fit those that are whole")
+    return left | {
+        photo.name: f"its shape is {name}, not {usual}, and no Exif says its focal length: is it cropped?"
+        for photo, name in _of_unknown_lens(shapes, usual)
+    }
+
+
+def _usual(groups: Mapping[str, list[OpenPhoto]]) -> str | None:
+    """The largest group, or None if others would be left out, and it has too few photos or no more than another one."""
+    usual = max(groups, key=lambda name: len(groups[name]))
+    sizes = sorted((len(group) for group in groups.values()), reverse=True)
+    if _of_unknown_lens(groups, usual) and (sizes[0] < MIN_PHOTOS or sizes[0] == sizes[1]):
+        return None
+    return usual
+
+
+def _of_unknown_lens(groups: Mapping[str, list[OpenPhoto]], usual: str) -> list[tuple[OpenPhoto, str]]:
+    """The photos of other groups, and the name of each one's group, whose Exif says no focal length."""
+    others = [(photo, name) for name, group in groups.items() for photo in group if name != usual]
+    return [(photo, name) for photo, name in others if not photo.focal_ratio]
+
+
+def _listed(groups: Mapping[str, list[OpenPhoto]]) -> str:
+    return "; ".join(f"{name}: {listed_files([photo.path for photo in group])}" for name, group in groups.items())
 
 
 def _lens_numbers(photos: list[OpenPhoto]) -> dict[str, int]:

@@ -13,7 +13,7 @@ from kgs._support.errors import DataError
 from kgs.app.files.outputs import write_png
 from kgs.datasets.layouts.colmap_model import read_cameras, read_images, read_points
 
-from .map import Cameras, cameras_of, quiet_pycolmap
+from .map import Cameras, cameras_of
 from .pycolmap_processes import check_space
 from .read import Photo
 
@@ -51,33 +51,34 @@ def upright(cameras: Cameras, turned: set[str], names: Mapping[str, str]) -> Cam
     if turned.isdisjoint(cameras.rotations):
         return cameras
     scene = cameras.reconstruction
-    with quiet_pycolmap() as pycolmap:
-        found = pycolmap.Reconstruction()
-        count = max(scene.cameras)
-        for camera_id, lens in scene.cameras.items():
-            focal, x, y, distortion = lens.params
-            other = pycolmap.Camera.create_from_model_name(
-                count + camera_id, "SIMPLE_RADIAL", focal, lens.height, lens.width
-            )
-            other.params = [focal, y, lens.width - x, distortion]
-            found.add_camera_with_trivial_rig(lens)
-            found.add_camera_with_trivial_rig(other)
-        back = pycolmap.Rigid3d(pycolmap.Rotation3d(_COUNTERCLOCKWISE), np.zeros(3))
-        for image_id, image in scene.images.items():
-            if not image.has_pose:
-                continue
-            lens = scene.cameras[image.camera_id]
-            is_turned = names[image.name] in turned
-            keypoints = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
-            pose = image.cam_from_world()
-            if is_turned:
-                keypoints = np.stack([keypoints[:, 1], lens.width - keypoints[:, 0]], 1)
-                pose = back * pose
-            camera_id = lens.camera_id + is_turned * count
-            new = pycolmap.Image(name=image.name, keypoints=keypoints, camera_id=camera_id, image_id=image_id)
-            found.add_image_with_trivial_frame(new, pose)
-        for point_id, point in scene.points3D.items():
-            found.add_point3D_with_id(point_id, point)
+    import pycolmap
+
+    found = pycolmap.Reconstruction()
+    count = max(scene.cameras)
+    for camera_id, lens in scene.cameras.items():
+        focal, x, y, distortion = lens.params
+        other = pycolmap.Camera.create_from_model_name(
+            count + camera_id, "SIMPLE_RADIAL", focal, lens.height, lens.width
+        )
+        other.params = [focal, y, lens.width - x, distortion]
+        found.add_camera_with_trivial_rig(lens)
+        found.add_camera_with_trivial_rig(other)
+    back = pycolmap.Rigid3d(pycolmap.Rotation3d(_COUNTERCLOCKWISE), np.zeros(3))
+    for image_id, image in scene.images.items():
+        if not image.has_pose:
+            continue
+        lens = scene.cameras[image.camera_id]
+        is_turned = names[image.name] in turned
+        keypoints = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
+        pose = image.cam_from_world()
+        if is_turned:
+            keypoints = np.stack([keypoints[:, 1], lens.width - keypoints[:, 0]], 1)
+            pose = back * pose
+        camera_id = lens.camera_id + is_turned * count
+        new = pycolmap.Image(name=image.name, keypoints=keypoints, camera_id=camera_id, image_id=image_id)
+        found.add_image_with_trivial_frame(new, pose)
+    for point_id, point in scene.points3D.items():
+        found.add_point3D_with_id(point_id, point)
     return cameras_of(found, names, cameras.focal_rise)
 
 
@@ -88,6 +89,8 @@ def level_and_scale(cameras: Cameras) -> None:
         OpenCV's axes: afterwards y points down and, for the first photo, z forward as far as that is level. The origin
         is the mean of the cameras' centres.
     """
+    import pycolmap
+
     scene = cameras.reconstruction
     names = list(cameras.rotations)
     first = cameras.rotations[names[0]]
@@ -96,8 +99,7 @@ def level_and_scale(cameras: Cameras) -> None:
     depths = np.concatenate([_depths(scene, image) for image in scene.images.values()])
     scale = 1.0 / float(np.median(depths))
     center = np.mean([cameras.centers[name] for name in names], axis=0)
-    with quiet_pycolmap() as pycolmap:
-        scene.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(turned), -scale * turned @ center))
+    scene.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(turned), -scale * turned @ center))
 
 
 def write_model(folder: Path, cameras: Cameras, images: Path) -> None:

@@ -1,4 +1,4 @@
-"""What cameras write into photos: orientation, as OpenCV applies it, and focal length, by the rules of CIPA."""
+"""Photos as they are read: their Exif, by the rules of CIPA, their shapes and lenses, and those unlike the others."""
 
 import io
 from functools import partial
@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 import PIL.Image
 import pytest
-from photo_folders import exif, planes, with_exif
+from photo_folders import exif, planes, with_exif, write_photos
 
 from kgs._support.errors import DataError
 from kgs._support.progress import silent
-from kgs.app.sfm.leave_out import unlike_others
-from kgs.app.sfm.read import Exif, open_photos, read_photos
+from kgs.app.sfm.match import lenses_of
+from kgs.app.sfm.read import Exif, open_photos, read_photos, unlike_others
 from kgs.datasets.image_file import ImageFile
 
 JPEG = cv2.imencode(".jpg", planes()[0], [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
@@ -117,3 +117,54 @@ def test_a_panorama_is_refused_and_how_to_cut_it_is_said(tmp_path, kind):
     cv2.imwrite(str(plain), ahead)
     (photo,) = open_photos([plain])
     assert not photo.is_panorama  # as wide, and no more
+
+
+def opened(folder, images, films):
+    return open_photos(sorted(write_photos(folder, images, films).glob("*.jpg")))
+
+
+def test_copies_and_photos_of_another_shape(tmp_path):
+    whole = list(planes())
+    images = [*whole, whole[1], whole[0][:120], 255 - whole[2]]
+    left = unlike_others(opened(tmp_path, images, [26, 26, 26, 26, 0, 13]))
+    assert left.keys() == {"IMG_4.jpg", "IMG_5.jpg"}
+    assert "same photo as IMG_2.jpg" in left["IMG_4.jpg"]
+    assert "240x120, not 240x180" in left["IMG_5.jpg"]
+    assert unlike_others(opened(tmp_path, images, [26] * 6)).keys() == {"IMG_4.jpg"}
+
+
+def test_each_focal_length_of_the_exif_is_a_lens(tmp_path):
+    images = [*planes(), 255 - planes()[0], 255 - planes()[1]]
+    photos = read_photos(opened(tmp_path, images, [13, 26, 27, 0, 26]), silent)
+    assert [photo.lens for photo in photos] == [1, 0, 0, 0, 0]
+    focal = 26 / np.hypot(36, 24) * np.hypot(240, 180)
+    assert [lens.focal_length for lens in lenses_of(photos)] == pytest.approx([focal, focal / 2])
+
+
+def test_of_a_photo_of_another_shape_the_middle_is_taken(tmp_path):
+    """With a lens and a mask of its own, upright or lying, reduced or not."""
+    whole = list(planes())
+    high = np.ascontiguousarray(np.rot90(whole[2][30:150]))
+    images = [*whole, whole[0][:, 30:210], whole[1][30:150], high, cv2.resize(whole[2][:90], (720, 270))]
+    films = [26, 26, 0, 26, 26, 26, 26]
+    (tmp_path / "masks").mkdir()
+    mask = np.zeros((120, 240), np.uint8)
+    mask[:, :120] = 255
+    cv2.imwrite(str(tmp_path / "masks" / "IMG_5.png"), mask)
+    photos = read_photos(opened(tmp_path, images, films), silent)
+    assert [photo.size for photo in photos] == [photos[0].size] * 7
+    assert [photo.whole is None for photo in photos] == [True] * 3 + [False] * 4
+    assert len({photo.lens for photo in photos[:3]}) == 1
+    assert len({photo.lens for photo in photos}) == 4  # 240x120 is there upright and lying
+    width, height = photos[0].size
+    scale = height / 120
+    for i, rows, columns in ((4, slice(0, 120), slice(40, 200)), (3, slice(22, 157), slice(0, 180))):
+        grey = cv2.cvtColor(cv2.imread(str(tmp_path / f"IMG_{i + 1}.jpg")), cv2.COLOR_BGR2GRAY)[rows, columns]
+        middle = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
+        difference = np.abs(photos[i].grey().astype(int) - middle)
+        assert difference.mean() <= (0.5 if i == 4 else 6)  # half a pixel for the square one
+    assert np.abs(photos[5].pixels.astype(int) - np.rot90(photos[5].upright().pixels, -1)).max() == 0
+    assert (photos[4].mask[:, : width // 2] == 255).all()
+    assert (photos[4].mask[:, width // 2 + 1 :] == 0).all()
+    assert photos[4].focal == pytest.approx(26 / np.hypot(36, 24) * np.hypot(240, 120) * scale)
+    assert photos[5].focal == pytest.approx(photos[4].focal)
