@@ -119,11 +119,11 @@ def pinhole_cameras(
 
 
 def select(cameras: PinholeCamera, index: SupportsIndex | Sequence[SupportsIndex] | slice | Tensor) -> PinholeCamera:
-    """Some of the cameras as a batch: one, those of several positions or of a slice, or those of a mask.
+    """Some of the cameras as a batch: one, those at several positions, or those of a slice.
 
     Args:
         cameras: C cameras.
-        index: an integer, integers, a slice, or a mask `(C,)`; on any device.
+        index: an integer, integers (a tensor of them on any device), or a slice.
 
     Raises:
         TypeError: positions are not integers.
@@ -132,9 +132,7 @@ def select(cameras: PinholeCamera, index: SupportsIndex | Sequence[SupportsIndex
     count = len(cameras.extrinsics)
     if isinstance(index, slice):
         index = range(count)[index]
-    rows = index.cpu() if isinstance(index, Tensor) else torch.as_tensor(index, device="cpu")
-    if rows.dtype == torch.bool and rows.shape == (count,):
-        rows = rows.nonzero()
+    rows = index if isinstance(index, Tensor) else torch.as_tensor(index, device="cpu")
     if rows.numel() and (rows.is_floating_point() or rows.is_complex() or rows.dtype == torch.bool):
         raise TypeError(f"index: expected integers, got {rows.dtype}")
     rows = rows.reshape(-1).long()

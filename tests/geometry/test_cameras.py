@@ -105,12 +105,14 @@ def test_convention_half_pixel_centres_are_colmaps():
 
 
 def test_points_project_to_pixels_and_back():
-    cameras = three(torch.float32)
-    pixels, depths = project(cameras, points().float())
-    assert pixels.dtype == depths.dtype == torch.float64
+    cameras = three()
+    pixels, depths = project(cameras, points())
+    of_float32 = project(to(cameras, dtype=torch.float32), points().float())
+    assert all(values.dtype == torch.float64 for values in of_float32)
+    torch.testing.assert_close(of_float32[0], pixels, rtol=0, atol=1e-4)
     for view in range(3):
         back = unproject(cameras, pixels[:, view], depths[:, view], torch.full((40,), view))
-        torch.testing.assert_close(back, points(), rtol=0, atol=1e-6)
+        torch.testing.assert_close(back, points())
         turn, shift = relative_projection(cameras, 0, view)
         rays = torch.cat([pixels[:, 0], torch.ones(40, 1)], 1) * depths[:, :1]
         there = rays @ turn.mT + shift
@@ -128,9 +130,7 @@ def test_a_cut_begins_at_its_corner():
     assert image_size(cut) == (20, 30)
 
 
-@pytest.mark.parametrize(
-    "index", [1, -1, [2, 0], (0,), slice(1, None), torch.tensor([2, 0]), torch.tensor([True, False, True]), []]
-)
+@pytest.mark.parametrize("index", [1, -1, [2, 0], (0,), slice(1, None), torch.tensor([2, 0]), []])
 def test_selected_cameras_are_those_of_the_tensors(index):
     cameras = batch(pinhole(3, 4, 5.0), pinhole(6, 7, 8.0), pinhole(9, 10, 11.0))
     rows = torch.arange(3)[torch.tensor(index, dtype=torch.int64) if isinstance(index, list) else index].reshape(-1)

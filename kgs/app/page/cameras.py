@@ -105,7 +105,7 @@ def are_training(parts: Sequence[str]) -> list[bool]:
 
 def training_cameras(cameras: PinholeCamera, parts: Sequence[str]) -> PinholeCamera:
     """Those of the training photos, on the CPU; see :func:`are_training`."""
-    return to(select(cameras, torch.tensor(are_training(parts))), "cpu")
+    return to(select(cameras, np.flatnonzero(are_training(parts)).tolist()), "cpu")
 
 
 def _nearest_mean_pose(rotations: Array, positions: Array, training: Sequence[bool]) -> list[int]:
