@@ -22,7 +22,7 @@ from .targets import background_of
 from .view_renders import ViewRenders
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fit:
     """A splat of a scene, and how it came about.
 

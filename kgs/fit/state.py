@@ -47,7 +47,7 @@ class Start:
     depth: float
 
 
-@dataclass
+@dataclass(eq=False)
 class TrainState:
     """Everything that the rest of a fit depends on, besides its scene and its plan.
 

@@ -30,7 +30,7 @@ DRAWS = ("uniform", "spread")
 MIN_DENSE = 1000
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class InitialPoints(ShownByShapes):
     """The points that a fit starts from, with their colours.
 

@@ -29,7 +29,7 @@ BASELINE = 0.15  # the best distance of a neighbour, over the depth: shorter is 
 FARTHEST = 100.0  # the largest depth of a sweep to infinity, in units of `far`
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DepthMap:
     """Depths and scores of the pixels of one view, `(H, W)`."""
 

@@ -21,7 +21,7 @@ MAX_ERROR = 0.75  # pixels between a point and its observation
 MIN_ANGLE = 1.0  # degrees between the two most different rays of a point
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TrackedPoints:
     """P points in the world with their projections into V views, and where these views see them."""
 

@@ -21,7 +21,7 @@ _NUMBER = 4  # bytes
 Floats = NDArray[np.float32]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Done:
     """A band after the forward pass."""
 

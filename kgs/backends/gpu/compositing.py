@@ -23,7 +23,7 @@ LANES = 32  # Gaussians of a program that goes through their tiles
 _BLOCK = 128  # Gaussians or entries of another
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Rows:
     """A row slice: rows of tiles, numbered through all cameras, and where the entries of each Gaussian begin."""
 
@@ -33,7 +33,7 @@ class _Rows:
     entries: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Lists:
     """The lists of a row slice, and what its forward pass left; the tensors are those of `.compositing_kernels`."""
 

@@ -62,7 +62,7 @@ def project(
     return projected
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Visible:
     """Which pairs (camera, Gaussian) are visible; the tensors are those of `.projection_kernels`."""
 
@@ -72,7 +72,7 @@ class _Visible:
     numbers: Tensor
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Listed:
     """The visible pairs, row by row."""
 

@@ -182,7 +182,7 @@ class Wanted:
         return sum(self.widths(features))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Columns:
     """A column of numbers for each Gaussian of a depth slice."""
 
@@ -209,7 +209,7 @@ class Thresholds:
         return cls(floor, alpha, _below(stop, dtype) if stop else -1.0)
 
 
-@dataclass
+@dataclass(eq=False)
 class Step:
     """K layers of n tiles, and what the backward pass needs of them."""
 

@@ -49,7 +49,7 @@ def project(
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Frustum:
     """What makes a Gaussian visible."""
 
