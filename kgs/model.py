@@ -73,8 +73,7 @@ class GaussianModel(nn.Module):
         values = dict(zip(PARAMETERS, (means, quats, log_scales, opacity_logits, sh_dc, sh_rest), strict=True))
         for name, value in values.items():
             check_tensor(name, value)
-            if value.dtype not in (torch.float32, torch.float64):
-                raise TypeError(f"{name}: expected float32 or float64, got {value.dtype}")
+            _check_dtype(name, value)
             check_tensor(name, value, means, " as means")
         highest = _check_shapes(list(values.values()))
         self.means = nn.Parameter(means.detach().clone())
@@ -106,8 +105,7 @@ class GaussianModel(nn.Module):
         """
         check_tensor("points", points)
         check_tensor("colors", colors)
-        if points.dtype not in (torch.float32, torch.float64):
-            raise TypeError(f"points: expected float32 or float64, got {points.dtype}")
+        _check_dtype("points", points)
         if not colors.is_floating_point():
             raise TypeError(f"colors: expected floating point values, got {colors.dtype}")
         if points.ndim != 2 or points.shape[1] != 3 or colors.shape != points.shape:
@@ -131,8 +129,11 @@ class GaussianModel(nn.Module):
     def select(self, rows: Tensor, sh_degree: int | None = None) -> "GaussianModel":
         """A new model of the Gaussians at `rows`: a mask `(N,)` or indices `(M,)`.
 
-        `sh_degree` is the highest degree of the harmonics that are kept; None keeps all.
+        `sh_degree` is the highest degree of the harmonics that are kept; None keeps all. A ValueError for a mask of
+        another length.
         """
+        if rows.dtype == torch.bool and rows.shape != (len(self),):
+            raise ArgumentError(f"rows: expected a mask of shape ({len(self)},), got {tuple(rows.shape)}")
         degree = self.max_sh_degree if sh_degree is None else _check_degree(sh_degree, self.max_sh_degree)
         values = {name: parameter.detach()[rows] for name, parameter in self.named_parameters()}
         values["sh_rest"] = values["sh_rest"][:, : SH_SIZES[degree] - 1]
@@ -161,9 +162,11 @@ class GaussianModel(nn.Module):
             backend: "auto", or the name of one, see `kgs.backends`. By "triton" differentiable once.
 
         Raises:
+            TypeError: the model was moved to another dtype than float32 and float64.
             ValueError: the backend does not exist, or does not cover a model of this dtype or device.
             ModuleNotFoundError: the backend is numba or triton, and it is not installed.
         """
+        _check_dtype("model", self.means)
         chosen = choose(backend, "activation", self.means.device, lambda candidate: candidate.covers(self.means))
         # at degree 0 sh_rest gets no gradient, and an optimiser skips it
         parameters = (self.log_scales, self.opacity_logits, self.sh_dc, self.sh_rest)
@@ -203,6 +206,11 @@ class GaussianModel(nn.Module):
         antialiased = ", antialiased" if self.antialiased else ""
         degrees = f"sh_degree={self.sh_degree} of {self.max_sh_degree}"
         return f"{len(self)} Gaussians, {degrees}, {self.means.dtype}{antialiased}"
+
+
+def _check_dtype(name: str, value: Tensor) -> None:
+    if value.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"{name}: expected float32 or float64, got {value.dtype}")
 
 
 def _check_degree(value: int, highest: int) -> int:
