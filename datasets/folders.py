@@ -1,17 +1,15 @@
-"""What a folder holds, judged by the names of its files: photos, videos, or a scene and its layout.
+"""What a folder holds, judged by the names of its files: photos, or a scene and its layout.
 
 Loads neither NumPy nor torch, so that the command reports a wrong folder at once.
 """
 
 import os
 import re
-import warnings
-from collections.abc import Iterable
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
-from kgs._support.errors import DataError
+from kgs._support.errors import DataError, listed, quantity
 
 _JPEG = (".jpg", ".jpeg", ".jpe", ".jfif", ".jif", ".pjpeg", ".pjp")
 IMAGE_SUFFIXES = (".png", *_JPEG, ".webp", ".bmp", ".dib", ".tif", ".tiff")
@@ -25,59 +23,19 @@ _OTHERS = (
     *(".exr", ".hdr", ".psd", ".tga", ".ppm", ".pgm", ".pnm"),
 )
 UNREADABLE_SUFFIXES = (*_RAW, *HEIC_SUFFIXES, *_OTHERS)
-# How files begin that are pictures whatever their name is; of BMP and of the family of HEIC see `holds_picture`.
-_SIGNATURES = (
-    *(b"\x89PNG\r\n", b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"GIF8"),
-    *(b"\xff\x0a", b"\0\0\0\x0cJXL ", b"\0\0\0\x0cjP  "),
-)
-_FAMILIES = (b"hei", b"hev", b"mif", b"msf", b"avi", b"crx")  # brands, of HEIC, AVIF and Canon's raw
+PICTURE_SUFFIXES = (*IMAGE_SUFFIXES, *UNREADABLE_SUFFIXES)
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mpg", ".mpeg", ".mts")
 # What says where the cameras of a scene are, in the order in which it is looked for; a COLMAP model comes second.
 LAYOUT_FILES = {"LLFF": "poses_bounds.npy", "Blender": "transforms_train.json", "nerfstudio": "transforms.json"}
-_AS_MODEL = "export the cameras of {} as a COLMAP model to use them"
-_CONVERTED = "it is of {}: nerfstudio's ns-process-data {} makes a scene of the export; kgs fit takes {} alone"
-_ALONE = "it has the poses of {}, which are not read: kgs fit takes {} alone"
-_RECORDING = "it is a recording of Record3D: export it as EXR and JPG, for nerfstudio's ns-process-data record3d"
-# Of programs and data sets whose poses are not read: the files that show it, all of them, and what to do.
-_NOT_READ = {
-    ("reconstruction.json",): _AS_MODEL.format("OpenSfM"),
-    ("cameras.sfm",): _AS_MODEL.format("Meshroom"),
-    ("sfm_data.json",): _AS_MODEL.format("OpenMVG"),
-    ("cameras.xml",): _AS_MODEL.format("Metashape"),
-    ("bundle.out",): _AS_MODEL.format("Bundler"),
-    ("*.nvm",): _AS_MODEL.format("VisualSFM"),
-    ("keyframes/*cameras/*.json",): _CONVERTED.format("Polycam", "polycam", "keyframes/images"),
-    ("*cameras/*.json", "images"): _CONVERTED.format("Polycam", "polycam", "images"),
-    ("metadata.json", "*.exr"): _CONVERTED.format("Record3D", "record3d", "rgb"),
-    ("metadata.json", "*/*.exr"): _CONVERTED.format("Record3D", "record3d", "rgb"),
-    ("EXR_RGBD/metadata.json",): _CONVERTED.format("Record3D", "record3d", "EXR_RGBD/rgb"),
-    ("*.r3d",): _RECORDING,
-    ("rgbd/*.depth",): _RECORDING,  # unpacked
-    ("opensfm/reconstruction.json",): _CONVERTED.format("OpenDroneMap", "odm", "images"),
-    ("odometry.csv", "camera_matrix.csv"): _ALONE.format("Stray Scanner", "rgb.mp4"),
-    ("info.json", "frame_*.json"): _ALONE.format("3D Scanner App", "its photos"),
-    ("lowres_wide.traj",): _ALONE.format("ARKitScenes", "lowres_wide"),
-    ("pose/*.txt", "intrinsic/*.txt"): _ALONE.format("ScanNet", "color"),
-    ("pose/*.txt", "intrinsics.txt"): _ALONE.format("NSVF", "rgb"),
-    ("cameras_sphere.npz",): _ALONE.format("NeuS", "image"),
-    ("cams/*_cam.txt",): _ALONE.format("MVSNet", "images"),
-}
-_MISSPELLED = {
-    "transform.json": "transforms.json",
-    "transform_train.json": "transforms_train.json",
-    "transform_test.json": "transforms_test.json",
-}
-MASK_FOLDERS = ("masks", "mask")
-MASK_FILES = "dynamic_mask_"  # instant-ngp's, beside the photos
-_MASK_NAME = re.compile(r"mask[ _.-](.+)|(.+)[ _.-]mask")
-# Names that only look like those of masks.
-_LIKE_MASKS = re.compile(r"mask|matte|segment|(?<![a-z])(seg|alpha)(?![a-z])")
-_SAME = 8  # levels between the channels of a grey picture that was compressed with loss
-MASKS_ARE_IN = "masks are in masks/ or the folder that --masks names, or beside their photos as IMG_1_mask.png"
 CAMERAS_REPORT = "photos.json"  # beside a scene whose cameras kgs found: how they were found
-_NO_POSES = "kgs fit finds them; or run COLMAP (its model goes to sparse/0), or nerfstudio's ns-process-data"
-_TO_CONVERT = "photos that cannot be read: convert them to JPEG or PNG"
-_NO_PHOTOS = "take photos out (ns-process-data video does that and finds poses)"
+_MAY_HOLD_CAMERAS = (".json", ".xml", ".xmp", ".csv", ".nvm", ".out", ".sfm", ".npy", ".npz", ".traj", ".r3d")
+MASKS = "masks"  # the folder of masks
+MASKS_ARE_IN = f"masks are in {MASKS}/ or the folder that --masks names, as IMG_1.png or IMG_1.jpg.png for IMG_1.jpg"
+_MASK_OF = re.compile(r"(?:dynamic_)?mask[ _.-](.+)|(.+)[ _.-]mask")
+_LIKE_MASK = re.compile(r"mask|matte|segment|(?<![a-z])(seg|alpha)(?![a-z])")
+# How files begin that are pictures whatever their name is; of WebP and the family of HEIC see `holds_picture`.
+_SIGNATURES = (b"\x89PNG\r\n", b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"GIF8")
+_FAMILIES = (b"hei", b"hev", b"mif", b"msf", b"avi", b"crx")  # brands, of HEIC, AVIF and Canon's raw
 
 
 @cache
@@ -87,83 +45,30 @@ def has_heic() -> bool:
 
 
 def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list[Path]:
-    """The photos of a folder, sorted by name; hidden files, masks and other kinds of files are passed over."""
-    masks = {*masks_beside(folder)}
-    return [path for path in list_pictures(folder, suffixes) if path not in masks]
+    """The photos of a folder, sorted by name; what is named like a mask of a picture there is passed over."""
+    pictures = list_pictures(folder, PICTURE_SUFFIXES)
+    names = {name.lower() for path in pictures for name in (path.name, path.stem)}
+    return [path for path in pictures if path.name.lower().endswith(suffixes) and _photo_of(path) not in names]
 
 
 def list_pictures(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list[Path]:
-    """As `list_images`, with masks, but for those of instant-ngp."""
+    """The pictures of a folder, masks among them, sorted by name; hidden files are passed over."""
     with os.scandir(folder) as entries:  # which know without a look at the disk whether they are folders
         files = [entry for entry in entries if entry.name.lower().endswith(suffixes) and not entry.is_dir()]
-    return [folder / name for name in sorted(file.name for file in files) if not name.startswith((".", MASK_FILES))]
+    return [folder / name for name in sorted(file.name for file in files) if not name.startswith(".")]
 
 
-def masks_beside(folder: Path) -> dict[Path, Path]:
-    """The photos in a folder by their masks in it: grey pictures whose names contain those of the photos.
-
-    The names are those of `photo_of_mask`; one that does not say that it is a mask ends in `.png`, as COLMAP writes it.
-    """
-    pictures = list_pictures(folder, UNREADABLE_SUFFIXES) + list_pictures(folder)
-    of_name = {path.name.lower(): path for path in pictures}
-    of_stem = {path.stem.lower(): path for path in pictures}
-    masks = dict[Path, Path]()
-    for path in pictures:
-        name, is_marked = photo_of_mask(path)
-        photo = of_name.get(name) or (of_stem.get(name) if is_marked else None)
-        suffixes = IMAGE_SUFFIXES if is_marked else (".png",)
-        if photo is not None and path.suffix.lower() in suffixes and _is_grey(path):
-            masks[path] = photo
-    return masks
-
-
-def _is_grey(path: Path) -> bool:
-    """Whether a file is a picture without colours, as masks are."""
-    try:
-        status = path.stat()
-        return _is_grey_now(path, status.st_mtime_ns, status.st_size)
-    except OSError:
-        return False
-
-
-@cache
-def _is_grey_now(path: Path, time: int, size: int) -> bool:
-    """`_is_grey` of a file that was changed at this time."""
-    from PIL import Image, ImageChops
-
-    try:
-        with warnings.catch_warnings(action="ignore"), Image.open(path) as image:  # of many pixels, damaged metadata
-            if image.mode in ("1", "L", "LA") or image.mode.startswith("I"):
-                return True
-            red, *others = image.convert("RGB").split()
-        return not any(any(ImageChops.difference(red, other).histogram()[_SAME + 1 :]) for other in others)
-    except Exception:  # damaged bytes raise whatever Pillow's plugins happen to raise
-        return False
-
-
-def photo_of_mask(mask: Path) -> tuple[str, bool]:
-    """The name or stem of the photo, in lower case, that a file is a mask of if it is one; whether its name says so.
-
-    It is "img_1" of `IMG_1_mask.png`, `mask_IMG_1.png` and `IMG_1.png`, and "img_1.jpg" of `IMG_1.jpg.png`. The first
-    two say that they are masks.
-    """
-    stem = mask.stem.lower()
-    match = _MASK_NAME.fullmatch(stem)
-    return (match[1] or match[2], True) if match else (stem, False)
-
-
-def mask_folders(outer_folders: Iterable[Path]) -> list[Path]:
-    """The folders of masks in other folders: `masks` first, then `mask`, in upper or lower case."""
-    found = []
-    for outer in filter(Path.is_dir, outer_folders):
-        inner = [path for path in sorted(outer.iterdir()) if path.name.lower() in MASK_FOLDERS and path.is_dir()]
-        found += sorted(inner, key=lambda path: MASK_FOLDERS.index(path.name.lower()))
-    return found
+def _photo_of(path: Path) -> str | None:
+    """The name or stem of the photo whose mask a picture says to be, as IMG_1_mask.png and IMG_1.jpg.png; or None."""
+    stem = path.stem.lower()
+    if match := _MASK_OF.fullmatch(stem):
+        return match[1] or match[2]
+    return stem if path.suffix.lower() == ".png" and stem.endswith(PICTURE_SUFFIXES) else None
 
 
 def is_like_mask(path: Path) -> bool:
-    """Whether a folder or picture that is not taken for masks is named like one."""
-    return _LIKE_MASKS.search(path.stem.lower()) is not None
+    """Whether a folder or picture that is not used as a mask is named like one."""
+    return _LIKE_MASK.search(path.stem.lower()) is not None
 
 
 def holds_picture(path: Path) -> bool:
@@ -173,9 +78,8 @@ def holds_picture(path: Path) -> bool:
             head = file.read(12)
     except OSError:
         return False
-    is_webp = head[:4] == b"RIFF" and head[8:12] == b"WEBP"
-    is_bmp = head[:2] == b"BM" and head[6:10] == bytes(4)
-    return is_webp or is_bmp or head.startswith(_SIGNATURES) or (head[4:8] == b"ftyp" and head[8:11] in _FAMILIES)
+    is_of_family = head[4:8] == b"ftyp" and head[8:11] in _FAMILIES
+    return head.startswith(_SIGNATURES) or head[8:] == b"WEBP" or is_of_family
 
 
 def image_folder(root: Path, name: str = "") -> Path | None:
@@ -184,7 +88,7 @@ def image_folder(root: Path, name: str = "") -> Path | None:
     With a name the folder of that name; a DataError where there is none.
     """
     if name and not (root / name).is_dir():
-        raise DataError(root, "", f"expected the photos in {name}/, found no such folder")
+        raise DataError(root, "", f"the photos in {name}/", "no such folder")
     if name or (root / "images").is_dir():
         return root / (name or "images")
     reduced = [p for p in root.glob("images_*") if p.is_dir() and p.name.removeprefix("images_").isdecimal()]
@@ -199,7 +103,8 @@ def find_models(root: Path) -> list[Path]:
     numbered = [p for p in (root / "sparse").glob("*") if p.name.isdecimal()]
     numbered.sort(key=lambda p: int(p.name))
     models = [folder for folder in (*numbered, root / "sparse") if _has_model_file(folder, "images")]
-    return models + ([root] if _is_model_beside_photos(root) else [])
+    is_beside_photos = _is_model(root) and (image_folder(root) is not None or bool(list_images(root)))
+    return models + ([root] if is_beside_photos else [])
 
 
 def layout_of(root: Path) -> str | None:
@@ -223,26 +128,19 @@ def _is_model(folder: Path) -> bool:
     return _has_model_file(folder, "images") and _has_model_file(folder, "cameras")
 
 
-def _is_model_beside_photos(root: Path) -> bool:
-    return _is_model(root) and (image_folder(root) is not None or bool(list_images(root)))
-
-
 def unused_files(root: Path, layout: str | None = None) -> tuple[str, ...]:
-    """What a folder holds besides the files of its layout, or of any, that looks like cameras: one sentence each."""
+    """What a folder holds besides the files of its layout that says, or may say, where cameras are: a sentence each."""
+    if layout is not None:
+        others = [name for other, name in LAYOUT_FILES.items() if other != layout and (root / name).is_file()]
+        others += ["the COLMAP model"] if _is_model(root) and layout in ("Blender", "nerfstudio") else []
+        return tuple(f"{name} is not used: the scene is read as {layout}" for name in others)
     sentences = []
-    for other, name in LAYOUT_FILES.items():
-        if other != layout and (root / name).is_file():
-            sentences.append(f"{name} is not used: the scene is read as {layout}")
-    if _is_model(root) and layout is None:
+    if _is_model(root):
         sentences.append("the COLMAP model is not used: expected its photos beside it or in images/")
-    if _is_model(root) and layout in ("Blender", "nerfstudio"):
-        sentences.append(f"the COLMAP model is not used: the scene is read as {layout}")
-    for patterns, advice in _NOT_READ.items():
-        if all(any(root.glob(pattern)) for pattern in patterns):
-            sentences.append(f"{' with '.join(patterns)} is not used: {advice}")
-    for name, right in _MISSPELLED.items():
-        if (root / name).is_file():
-            sentences.append(f"{name} is not used: expected the name {right}")
+    files = [path for path in sorted(root.iterdir()) if path.suffix.lower() in _MAY_HOLD_CAMERAS]
+    if names := [path.name for path in files if path.name[0] != "." and path.is_file()]:
+        read = f"{', '.join(LAYOUT_FILES.values())} and COLMAP models"
+        sentences.append(f"cameras in {listed(names)} would not be read: kgs reads those in {read}")
     return tuple(sentences)
 
 
@@ -256,9 +154,21 @@ def scene_nearby(root: Path) -> Path | None:
     return next(filter(layout_of, others), None)
 
 
-def why_no_scene(root: Path) -> str:
-    """Why a file or folder is not a scene: what it is or holds instead, and what to do."""
-    return _about_folder(root) if root.is_dir() else _about_file(root)
+def no_scene(root: Path) -> DataError:
+    """The error about a file or folder that is not a scene, which says what to do."""
+    if not root.exists():
+        return DataError(root, "", "a folder", "none")
+    got = "another folder" if root.is_dir() else "a file"
+    if folder := scene_nearby(root):
+        return DataError(root, "", "a scene", got, advice=f"{folder} is one: give that folder")
+    if not root.is_dir():
+        meant = f"for photos, name their folder: {root.parent}" if root.suffix.lower() in PICTURE_SUFFIXES else ""
+        return DataError(root, "", "a folder", "a file", advice=meant)
+    advice = f"there is no {', '.join(LAYOUT_FILES.values())} or COLMAP model in sparse/0"
+    if count := len(list_images(image_folder(root) or root, PICTURE_SUFFIXES)):
+        got = f"{quantity(count, 'photo')} without camera poses"
+        advice = "kgs fit finds them, or COLMAP (its model goes to sparse/0)"
+    return DataError(root, "", "a scene", got, advice=". ".join([advice, *unused_files(root)]))
 
 
 def has_photos(scene: Path) -> bool:
@@ -266,45 +176,8 @@ def has_photos(scene: Path) -> bool:
     photos = image_folder(scene)
     if photos is not None and any(path.name[0] != "." for path in photos.iterdir()):
         return True
-    kinds = (*IMAGE_SUFFIXES, *UNREADABLE_SUFFIXES)
     for folder, folders, files in os.walk(scene):
-        if any(file.lower().endswith(kinds) for file in files):
-            return True
-        if any(os.path.islink(os.path.join(folder, name)) for name in folders):
+        links = [name for name in folders if os.path.islink(os.path.join(folder, name))]
+        if links or any(file.lower().endswith(PICTURE_SUFFIXES) for file in files):
             return True
     return False
-
-
-def _about_file(path: Path) -> str:
-    if not path.exists():
-        return "expected a folder, there is none"
-    if path.suffix.lower() in VIDEO_SUFFIXES:
-        return f"expected a folder, got a video: {_NO_PHOTOS}"
-    if layout_of(path.parent):
-        return f"expected a folder, got a file: the scene is {path.parent}"
-    advice = [advice for patterns, advice in _NOT_READ.items() if len(patterns) == 1 and path.match(patterns[0])]
-    if path.suffix.lower() == ".zip":
-        advice = ["it is an archive: unpack it first"]
-    if path.suffix.lower() in (*IMAGE_SUFFIXES, *HEIC_SUFFIXES):
-        advice = [f"for photos, name their folder: {path.parent}"]
-    return ": ".join(["expected a folder, got a file", *advice[:1]])
-
-
-def _about_folder(root: Path) -> str:
-    return ". ".join([_what_is_there(root), *unused_files(root)])
-
-
-def _what_is_there(root: Path) -> str:
-    if folder := scene_nearby(root):
-        return f"is not a scene, but {folder} is one: give that folder"
-    photos = image_folder(root) or root
-    if count := len(list_images(photos)):
-        return f"has {count} photos but no camera poses: {_NO_POSES}"
-    endings = [p.suffix.lower() for folder in {root, photos} for p in folder.iterdir() if not p.name.startswith(".")]
-    for suffixes, advice in ((UNREADABLE_SUFFIXES, _TO_CONVERT), (VIDEO_SUFFIXES, f"videos: {_NO_PHOTOS}")):
-        if kinds := [ending[1:].upper() for ending in endings if ending in suffixes]:
-            return f"is not a scene: it holds {len(kinds)} {' and '.join(sorted(set(kinds)))} {advice}"
-    return (
-        "is not a scene: looked for poses_bounds.npy (LLFF), sparse/0 (COLMAP), transforms_train.json (Blender) and "
-        "transforms.json (nerfstudio)"
-    )

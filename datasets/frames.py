@@ -44,17 +44,17 @@ class Frame:
         rotation = self.pose[:3, :3]
         numbers = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
         if not np.isfinite(numbers).all():
-            raise wrong("expected finite intrinsics, got NaN or infinity")
+            raise wrong("finite intrinsics", "NaN or infinity")
         if not (min(lens.fx, lens.fy) * LARGEST >= 1 and lens.width >= 1 and lens.height >= 1):
             got = f"{lens.fx:g}, {lens.fy:g} and {lens.width}x{lens.height}"
-            raise wrong(f"expected a focal length and an image size above 0, got {got}")
+            raise wrong("a focal length and an image size above 0", got)
         if self.pose.shape != (4, 4) or not bool(torch.isfinite(self.pose).all()):
-            raise wrong("expected a finite 4x4 pose")
+            raise wrong("a finite 4x4 pose")
         if max(lens.width, lens.height, *map(abs, numbers), float(center.abs().max())) > LARGEST:
-            raise wrong(f"expected intrinsics and a camera centre up to {LARGEST:g}")
+            raise wrong(f"intrinsics and a camera centre up to {LARGEST:g}")
         error = float((rotation.mT @ rotation - torch.eye(3, dtype=torch.float64)).abs().max())
         if not (error <= 1e-3 and float(torch.linalg.det(rotation)) > 0):  # the products may be NaN
-            raise wrong(f"expected a pose with a right-handed rotation, got {rotation.tolist()}")
+            raise wrong("a pose with a right-handed rotation", str(rotation.tolist()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,15 +87,15 @@ def path_inside(source: Path, root: Path, name: str, folder: Path | None = None)
     wrong = partial(DataError, source, repr(name[:200]))
     given = PureWindowsPath(name)  # knows both separators and drives; a file may have backslashes in its name, too
     if not name or "\0" in name or given.drive or given.root or ".." in given.parts:
-        raise wrong("expected the name of a file inside the scene's folder")
+        raise wrong("the name of a file inside the scene's folder")
     folder = folder or root
     try:
         path = folder / name if (folder / name).is_file() else folder / given.as_posix()
         target = Path(os.path.realpath(path))
     except (OSError, ValueError) as error:  # too long, or not to be written in the file system's encoding
-        raise wrong(f"expected the name of a file, got an impossible one ({error})") from error
+        raise wrong("the name of a file", "an impossible one", advice=str(error)) from error
     if not target.is_relative_to(os.path.realpath(root)):
-        raise wrong("expected a file inside the scene's folder, got a link that leads out")
+        raise wrong("a file inside the scene's folder", "a link that leads out")
     return path
 
 

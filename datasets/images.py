@@ -116,7 +116,7 @@ def rectification(intrinsics: Intrinsics) -> tuple[Intrinsics, Maps | None]:
         return replace(intrinsics, distortion=()), None
     width, height = intrinsics.width, intrinsics.height
     if max(width, height) > _LONGEST_REMAPPED:
-        raise ArgumentError(f"distortion: can be undone up to {_LONGEST_REMAPPED} pixels of width or height, got more")
+        raise ArgumentError("distortion", f"at most {_LONGEST_REMAPPED} pixels a side to undo it", max(width, height))
     zoom = _covering_zoom(intrinsics)
     pinhole = replace(intrinsics, fx=intrinsics.fx * zoom, fy=intrinsics.fy * zoom, distortion=(), fisheye=False)
     rectify = cv2.fisheye.initUndistortRectifyMap if intrinsics.fisheye else cv2.initUndistortRectifyMap
@@ -125,7 +125,8 @@ def rectification(intrinsics: Intrinsics) -> tuple[Intrinsics, Maps | None]:
     x, y = rectify(matrix, distortion, np.eye(3), pinhole.matrix(), (width, height), cv2.CV_32FC1)
     inside = x.min() >= -0.5 and y.min() >= -0.5 and x.max() <= width - 0.5 and y.max() <= height - 0.5
     if not inside or np.diff(x, axis=1).min(initial=1.0) <= 0 or np.diff(y, axis=0).min(initial=1.0) <= 0:
-        raise ArgumentError(f"distortion: {intrinsics.distortion} folds the image or maps it outside itself")
+        expected = "coefficients that neither fold the image nor map it outside itself"
+        raise ArgumentError("distortion", expected, intrinsics.distortion)
     return pinhole, (np.asarray(x, np.float32), np.asarray(y, np.float32))
 
 

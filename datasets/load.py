@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kgs._support.errors import DataError, listed
+from kgs._support.errors import ArgumentError, DataError, listed
 from kgs.geometry.cameras import pinhole_cameras
 
 from .border import with_border
@@ -82,8 +82,8 @@ def load_scene(
             (they are on torch's "meta" device), `masks` and `train_full_size` are None.
         photo_folder: where a scene (LLFF, COLMAP) has its photos in several sizes, the name of the folder to take, as
             "images_8"; "": that of the largest, `images` first. See also :func:`kgs.datasets.field.field_size`.
-        masks: a folder with masks of the photos, which have their stems; white is kept. None: those that the layout's
-            files name, or those in `masks/`, and those beside the photos (`IMG_1_mask.png`, `dynamic_mask_IMG_1.png`).
+        masks: a folder with masks of the photos, which have their stems or names; white is kept. None: the masks that
+            the layout's files name, else those in `masks/`.
         mask_mode: what black in a mask means. "ignore": such pixels are ignored (somebody walked by), see
             `Views.valid_mask`. "transparent": nothing is there, as where an image is transparent.
 
@@ -108,14 +108,15 @@ def load_scene(
         cloud = frame_set.points
         if points == "model-points":
             if frame_set.model_points is None:
-                raise DataError(root, "points", "model-points are not available: there is no COLMAP model")
+                raise DataError(root, "points", "a COLMAP model for model-points", "none")
             cloud = frame_set.model_points(train)
         farthest = float(cloud.points.abs().max()) if len(cloud.points) else 0.0
         if not farthest <= LARGEST:
-            raise DataError(root, "points", f"expected coordinates up to {LARGEST:g}, got {farthest:g}")
+            raise DataError(root, "points", f"coordinates up to {LARGEST:g}", f"{farthest:g}")
         if missing := [frame.path for frame in (*train, *test) if not frame.path.is_file()]:
             names = listed([path.relative_to(root) for path in missing], _LISTED)
-            raise DataError(root, "", f"{len(missing)} of {len(train) + len(test)} images are missing: {names}")
+            count = len(train) + len(test)
+            raise DataError(root, "", f"{count} images", count - len(missing), advice=f"there is no {names}")
         color = torch.tensor(BACKGROUNDS[background], dtype=torch.float32)
         offset = torch.stack([frame.pose[:3, 3] for frame in train]).mean(dim=0)  # float64; without the test views
         first = _usual(train)
@@ -148,7 +149,7 @@ def load_scene(
 
 
 def _with_masks(root: Path, frame_set: FrameSet, folder: Path | None) -> FrameSet:
-    """The frames with their masks: those in `folder`, else those that the files name, else those beside the photos."""
+    """The frames with their masks: those in `folder`, else those that the files name, else those in `masks/`."""
     parts = [frame_set.frames, frame_set.test or ()]
     if folder is None and any(frame.mask for frames in parts for frame in frames):
         return frame_set
@@ -183,14 +184,14 @@ def _split(
         if counts[frame.path] > 1:
             in_both = all(frame.path in {other.path for other in part} for part in (frames, test_frames))
             where = "in the training and in the test views" if in_both else "several times"
-            raise DataError(frame.source, frame.name, f"expected each image once, it is there {where}")
+            raise DataError(frame.source, frame.name, "each image once", f"it {where}")
     if frame_set.test is None or hold_out is not None:
         frames = [*frames, *test_frames]
         every = TEST_EVERY if hold_out is None else hold_out
         if len(frames) < 2 and every:
-            raise DataError(root, "", f"expected at least 2 posed images, one of them to test on, got {len(frames)}")
+            raise DataError(root, "", "at least 2 posed images, one of them to test on", len(frames))
         if not frames:
-            raise DataError(root, "", "expected posed images, got none")
+            raise DataError(root, "", "posed images", "none")
         names = [frame.name for frame in frames]
         if every and len(frames) > 2 and (root / CAMERAS_REPORT).is_file():  # of photos that came without cameras
             centers = torch.stack([frame.pose[:3, 3] for frame in frames]).numpy()
@@ -235,12 +236,11 @@ def _check_size(frame: Frame, width: int, height: int, scales: Sequence[_Scale])
     lens = frame.intrinsics
     if not lens.same_aspect(width, height):
         described = f"the {lens.width}x{lens.height} that {frame.source.name} describes"
-        raise DataError(frame.path, "", f"has {width}x{height} pixels, which is not a scaled version of {described}")
+        raise DataError(frame.path, "", f"a scaled version of {described}", f"{width}x{height} pixels")
     for scale in scales:
         size = _reduced(width, height, scale.factor)
         if scale.size not in (size, size[::-1]):
-            expected = f"expected {scale.first} pixels as the other images"
-            raise DataError(frame.path, "", f"{expected}, got {width}x{height}")
+            raise DataError(frame.path, "", f"{scale.first} pixels as the other images", f"{width}x{height}")
 
 
 def _is_turned(width: int, height: int, scale: _Scale) -> bool:
@@ -276,8 +276,8 @@ def _views(
         _check_size(frame, width, height, scales)
         try:
             lens, maps = rectify(frame.intrinsics.scaled(width, height))
-        except ValueError as error:
-            raise DataError(frame.source, frame.name, str(error)) from error
+        except ArgumentError as error:
+            raise error.about(frame.source, f"{error.name} of {frame.name}") from error
         kept = None
         if image is not None:
             if frame.mask is not None:

@@ -4,7 +4,7 @@ import math
 from numbers import Integral, Real
 from typing import Any
 
-from kgs._support.errors import ArgumentError
+from kgs._support.errors import ArgumentError, quoted
 
 MASK_MODES = ("ignore", "transparent")  # of black in a mask: ignored pixels, or empty space
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
@@ -29,10 +29,10 @@ def check_options(
     )
     for name, value, known in choices:
         if value not in known:
-            raise ArgumentError(f"{name}: expected one of {list(known)}, got {value!r}")
+            raise ArgumentError(name, f"one of {list(known)}", quoted(value))
     real = isinstance(downscale, Real)
     whole = isinstance(hold_out, Integral) and not isinstance(hold_out, bool)
     if downscale is not None and not (real and 1 <= downscale < math.inf):
-        raise ArgumentError(f"downscale: expected None or a number of at least 1, got {downscale!r}")
+        raise ArgumentError("downscale", "None or a number of at least 1", quoted(downscale))
     if hold_out is not None and not (whole and (hold_out == 0 or hold_out >= 2)):
-        raise ArgumentError(f"hold_out: expected None, 0 or a whole number of at least 2, got {hold_out!r}")
+        raise ArgumentError("hold_out", "None, 0 or a whole number of at least 2", quoted(hold_out))

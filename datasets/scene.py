@@ -66,31 +66,25 @@ class Views(ShownByShapes):
             given = self.images.dtype if isinstance(self.images, Tensor) else type(self.images).__name__
             raise TypeError(f"images: expected a tensor of floating point RGB in [0, 1], got {given}")
         if len(set(self.names)) < count:
-            raise ArgumentError("names: expected each once, got two that are equal")
+            raise ArgumentError("names", "each once", "two that are equal")
         if self.images.ndim != 4 or self.images.shape[:2] != (count, 3):
-            raise ArgumentError(f"images: expected shape ({count}, 3, H, W), got {tuple(self.images.shape)}")
+            raise ArgumentError("images", f"shape ({count}, 3, H, W)", tuple(self.images.shape))
         if self.cameras.batch_size != count:
-            raise ArgumentError(f"cameras: expected {count} as names, got {self.cameras.batch_size}")
+            raise ArgumentError("cameras", f"{count} as names", self.cameras.batch_size)
         height, width = self.images.shape[-2:]
         if not bool(((self.cameras.height == height) & (self.cameras.width == width)).all()):
             sizes = [self.cameras.height.tolist(), self.cameras.width.tolist()]
-            raise ArgumentError(f"cameras: expected height {height} and width {width} as images, got {sizes!s:.80}")
+            raise ArgumentError("cameras", f"height {height} and width {width} as images", sizes)
         if self.alphas is not None and tuple(self.alphas.shape) != (count, 1, height, width):
-            raise ArgumentError(
-                f"alphas: expected shape ({count}, 1, {height}, {width}), got {tuple(self.alphas.shape)}"
-            )
+            raise ArgumentError("alphas", f"shape ({count}, 1, {height}, {width})", tuple(self.alphas.shape))
         if self.border_mask is not None and tuple(self.border_mask.shape) != (height, width):
-            raise ArgumentError(f"border_mask: expected shape ({height}, {width}), got {tuple(self.border_mask.shape)}")
+            raise ArgumentError("border_mask", f"shape ({height}, {width})", tuple(self.border_mask.shape))
         if self.valid_mask is not None and tuple(self.valid_mask.shape) != (count, height, width):
-            raise ArgumentError(
-                f"valid_mask: expected shape ({count}, {height}, {width}), got {tuple(self.valid_mask.shape)}"
-            )
+            raise ArgumentError("valid_mask", f"shape ({count}, {height}, {width})", tuple(self.valid_mask.shape))
         if self.gains is not None and (tuple(self.gains.shape) != (count, 3) or not bool((self.gains > 0).all())):
-            raise ArgumentError(
-                f"gains: expected numbers above 0 of shape ({count}, 3), got {self.gains.tolist()!s:.80}"
-            )
+            raise ArgumentError("gains", f"numbers above 0 of shape ({count}, 3)", self.gains.tolist())
         if self.turned is not None and len(self.turned) != count:
-            raise ArgumentError(f"turned: expected {count} as names, got {len(self.turned)}")
+            raise ArgumentError("turned", f"{count} as names", len(self.turned))
 
     def __len__(self) -> int:
         return len(self.names)
@@ -185,7 +179,7 @@ class Views(ShownByShapes):
         size = self.images.shape[-2] // factor, self.images.shape[-1] // factor
         if 0 in size:
             given = tuple(self.images.shape[-2:])
-            raise ArgumentError(f"images: expected at least {factor} x {factor} pixels to downsample, got {given}")
+            raise ArgumentError("images", f"at least {factor} x {factor} pixels to downsample", given)
         return replace(
             self,
             cameras=resized(self.cameras, 1 / factor, size),
@@ -227,11 +221,9 @@ class Scene(ShownByShapes):
 
     def __post_init__(self) -> None:
         if len(self.train) == 0:
-            raise DataError(self.root, "train", "expected at least one training view, got none")
+            raise DataError(self.root, "train", "at least one training view", "none")
         if self.train_full_size is not None and self.train_full_size.names != self.train.names:
-            raise ArgumentError(
-                f"train_full_size: expected the views {self.train.names} as train, got {self.train_full_size.names}"
-            )
+            raise ArgumentError("train_full_size", f"the views {self.train.names} as train", self.train_full_size.names)
         shapes = tuple(self.points.shape), tuple(self.point_colors.shape)
         if shapes[0] != shapes[1] or len(shapes[0]) != 2 or shapes[0][1] != 3:
-            raise ArgumentError(f"points, point_colors: expected two of shape (P, 3), got {shapes[0]} and {shapes[1]}")
+            raise ArgumentError("points, point_colors", "two of shape (P, 3)", f"{shapes[0]} and {shapes[1]}")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from kgs._support.errors import DataError
 
-from .folders import layout_of, unused_files, why_no_scene
+from .folders import layout_of, no_scene, unused_files
 
 if TYPE_CHECKING:
     from .frames import FrameSet
@@ -33,7 +33,7 @@ class SceneSource:
         self.root = Path(root)
         layout = layout or layout_of(self.root)
         if layout is None:
-            raise DataError(self.root, "", why_no_scene(self.root))
+            raise no_scene(self.root)
         self.layout = layout
         self._frames: dict[str, FrameSet] = {}
 
@@ -61,7 +61,7 @@ class SceneSource:
         from .layouts import READERS
 
         if photo_folder and not self.has_sizes:
-            reason = f"expected a scene with several folders of photos for {photo_folder}, got {self.layout}"
-            raise DataError(self.root, "", reason)
+            expected = f"a scene with several folders of photos for {photo_folder}"
+            raise DataError(self.root, "", expected, self.layout)
         frames = READERS[self.layout](self.root, *([photo_folder] if self.has_sizes else []))
         return replace(frames, notes=(*frames.notes, *unused_files(self.root, self.layout)))

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from kgs._support.errors import ArgumentError
+from kgs._support.errors import ArgumentError, quoted
 
 from .options import held_out_between_ends
 
@@ -53,5 +53,5 @@ def select_evenly(count: int, train_views: int | None = None) -> list[int]:
         return list(range(count))
     if isinstance(train_views, bool) or not isinstance(train_views, int | np.integer) or not 1 <= train_views <= count:
         wanted = f"None or a whole number from 1 to {count}"
-        raise ArgumentError(f"train_views: expected {wanted}, got {train_views!r}")
+        raise ArgumentError("train_views", wanted, quoted(train_views))
     return [int(i) for i in np.round(np.linspace(0, count - 1, train_views))]

@@ -68,8 +68,8 @@ def save_compressed_ply(path: str | os.PathLike[str], model: GaussianModel, offs
     """
     check_kind("model", model, GaussianModel)
     if not len(model):
-        raise ArgumentError("model: expected at least one Gaussian, got none")
-    values = {name: parameter.detach().cpu().double().numpy() for name, parameter in model.named_parameters()}
+        raise ArgumentError("model", "at least one Gaussian", "none")
+    values = {name: parameter.detach().cpu().double().numpy() for name, parameter in model.per_gaussian().items()}
     if offset is not None:
         values["means"] = values["means"] + as_vector("offset", offset)
     _check_finite(values)
@@ -116,7 +116,7 @@ def _check_finite(values: dict[str, NDArray[np.float64]]) -> None:
         if name == "opacity_logits":
             invalid = np.isnan(array)
         if invalid.any():
-            raise ArgumentError(f"model: expected values that are finite in float32, got {array[invalid][0]} in {name}")
+            raise ArgumentError("model", "values that are finite in float32", f"{array[invalid][0]} in {name}")
 
 
 def _finite_scales(log_scales: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -65,10 +65,10 @@ class Densifier:
 
     Args:
         model: the Gaussians.
-        optimizer: ONE optimizer that holds each of the model's parameters (gsplat's dict of optimizers becomes one Adam
-            with a group for each); other parameters in it stay as they are. Its state for a
-            parameter consists of scalars and of tensors of that parameter's shape which start at 0: Adam, SGD,
-            RMSprop; not LBFGS or Adafactor.
+        optimizer: ONE optimizer that holds each of :meth:`GaussianModel.per_gaussian` (gsplat's dict of optimizers
+            becomes one Adam with a group for each); other parameters of model and optimizer stay as they are. Its
+            state for a parameter consists of scalars and of tensors of that parameter's shape which start at 0: Adam,
+            SGD, RMSprop; not LBFGS or Adafactor.
         extent: size of the camera rig in world units, > 0, see :func:`camera_extent`.
         grad_threshold: mean gradient from which a Gaussian is cloned or split, >= 0.
         absgrad: take the absolute gradients that renders with `RasterOptions.absgrad` leave; they are about four times
@@ -118,11 +118,11 @@ class Densifier:
             ("max_gaussians", max_gaussians, maximum >= 1 and maximum % 1 == 0, "an integer >= 1 or None"),
         ):
             if not fits:
-                raise ArgumentError(f"{name}: expected {expected}, got {number}")
+                raise ArgumentError(name, expected, number)
         if not hasattr(optimizer, "param_groups"):
             raise TypeError(f"optimizer: expected one torch.optim.Optimizer, got {type(optimizer).__name__}")
         if isinstance(optimizer, _UNSUPPORTED_OPTIMIZERS):
-            raise ArgumentError(f"optimizer: expected Adam, SGD or the like, got {type(optimizer).__name__}")
+            raise ArgumentError("optimizer", "Adam, SGD or the like", type(optimizer).__name__)
         self.model = model
         self.optimizer = optimizer
         self.extent = float(extent)
@@ -150,6 +150,7 @@ class Densifier:
         `absgrad` there is nothing to retain.
 
         Raises:
+            TypeError: `projected` is something else, as a whole `Rendering`.
             ValueError: `projected.means2d` has no gradient, or the number of Gaussians differs from the model's.
 
         Examples:
@@ -165,11 +166,12 @@ class Densifier:
             >>> densifier.observe(out.projected)
             >>> optimizer.step()
         """
+        check_kind("projected", projected, ProjectedGaussians)
         self._check_count()
         count = projected.num_gaussians
         expected = len(self.model)
         if count != expected:
-            raise ArgumentError(f"projected: expected a render of the model's {expected} Gaussians, got one of {count}")
+            raise ArgumentError("projected", f"a render of the model's {expected} Gaussians", f"one of {count}")
         if len(projected) == 0:
             return
         gradient = self._gradient_of(projected.means2d)
@@ -207,10 +209,10 @@ class Densifier:
         split = (over & large).nonzero()[:, 0]
         unchanged = (opaque & ~(over & large)).nonzero()[:, 0]
         added = torch.cat([cloned, split.repeat(CHILDREN)])
-        new = {name: parameter.index_select(0, added) for name, parameter in model.named_parameters()}
+        new = {name: parameter.index_select(0, added) for name, parameter in model.per_gaussian().items()}
         new["means"][len(cloned) :] += self._sample_offsets(split.repeat(CHILDREN))
         new["log_scales"][len(cloned) :] -= math.log(SHRINK)
-        for name, parameter in list(model.named_parameters()):
+        for name, parameter in model.per_gaussian().items():
             self._replace(name, torch.cat([parameter.index_select(0, unchanged), new[name]]), unchanged)
         self._restart_statistics(self.mean_gradients[torch.cat([unchanged, added])])
         return DensifyReport(
@@ -225,7 +227,7 @@ class Densifier:
     def reset_opacity(self, ceiling: float = 0.01) -> None:
         """Lower all opacities to at most `ceiling`, in (0, 1) (else a ValueError), and zero their moments."""
         if not 0.0 < ceiling < 1.0:
-            raise ArgumentError(f"ceiling: expected a number in (0, 1), got {ceiling}")
+            raise ArgumentError("ceiling", "a number in (0, 1)", ceiling)
         self._check()
         lowered = self.model.opacity_logits.clamp(max=math.log(ceiling / (1.0 - ceiling)))
         no_rows = torch.empty(0, dtype=torch.int64, device=lowered.device)
@@ -238,7 +240,7 @@ class Densifier:
         `rows`, bool `(N,)`, are the Gaussians whose opacities are meant; None: all.
         """
         if not 0.0 < factor < 1.0:
-            raise ArgumentError(f"factor: expected a number in (0, 1), got {factor}")
+            raise ArgumentError("factor", "a number in (0, 1)", factor)
         logits = self.model.opacity_logits
         if self._stages is not None and rows is None and logits.is_contiguous():
             self._stages.decay_opacity(logits, factor)
@@ -257,10 +259,10 @@ class Densifier:
         shape = (len(self.model),)
         missing = {*self._statistics, "generator"} - state.keys()
         if missing:
-            raise ArgumentError(f"state: expected the entries of state_dict, got none for {sorted(missing)}")
+            raise ArgumentError("state", "the entries of state_dict", f"none for {sorted(missing)}")
         for name in self._statistics:
             if state[name].shape != shape:
-                raise ArgumentError(f"{name}: expected shape {shape}, got {tuple(state[name].shape)}")
+                raise ArgumentError(name, f"shape {shape}", tuple(state[name].shape))
         self._restart_statistics(self.model.means.new_zeros(shape))
         for name, value in self._statistics.items():
             value.copy_(state[name])
@@ -270,14 +272,14 @@ class Densifier:
         """The gradients that the last backward pass stored in projected centres, `(M, 2)`."""
         if not means2d.requires_grad:
             why = "the means need requires_grad=True, and the render has to be made with gradients on"
-            raise ArgumentError(f"projected: expected means2d that require a gradient: {why}")
+            raise ArgumentError("projected", "means2d that require a gradient", advice=why)
         name = "absgrad" if self.absgrad else "grad"
         is_kept = self.absgrad or means2d.is_leaf or means2d.retains_grad  # torch warns where .grad is not kept
         gradient: Tensor | None = getattr(means2d, name, None) if is_kept else None
         if gradient is None:
             order = "and observe comes after backward"
             why = "the render needs absgrad=True" if self.absgrad else "means2d.retain_grad() comes after the render"
-            raise ArgumentError(f"projected: expected means2d.{name}, got None: {why}, {order}")
+            raise ArgumentError("projected", f"means2d.{name}", "None", advice=f"{why}, {order}")
         return gradient
 
     def _check_count(self) -> None:
@@ -285,24 +287,20 @@ class Densifier:
         count = len(self.model)
         expected = len(self._statistics["counts"])
         if count != expected:
-            raise ArgumentError(f"model: expected {expected} Gaussians, got {count}; load the densifier's state too")
+            raise ArgumentError("model", f"{expected} Gaussians", count, advice="load the densifier's state too")
 
     def _check(self) -> None:
         """Raise a ValueError if the model, its statistics and the optimizer's state do not belong together."""
         self._check_count()
         held = {id(parameter) for group in self.optimizer.param_groups for parameter in group["params"]}
-        for name, parameter in self.model.named_parameters():
+        for name, parameter in self.model.per_gaussian().items():
             if id(parameter) not in held:
-                raise ArgumentError(
-                    f"optimizer: expected it to hold all of the model's parameters, got none for {name}"
-                )
+                raise ArgumentError("optimizer", "it to hold all of the model's parameters", f"none for {name}")
             shape = tuple(parameter.shape)
             for key, entry in self.optimizer.state.get(parameter, {}).items():
                 if isinstance(entry, Tensor) and entry.numel() != 1 and entry.shape != shape:
                     got = tuple(entry.shape)
-                    raise ArgumentError(
-                        f"optimizer: expected the state {key} of {name} to have shape {shape}, got {got}"
-                    )
+                    raise ArgumentError("optimizer", f"the state {key} of {name} to have shape {shape}", got)
 
     def _sample_offsets(self, ids: Tensor) -> Tensor:
         """Draw an offset from the centre for each id, from that Gaussian's own distribution."""

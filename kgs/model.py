@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from kgs._support.checks import check_tensor
-from kgs._support.errors import ArgumentError
+from kgs._support.errors import ArgumentError, quoted
 
 from .backends import choose
 from .geometry.harmonics import SH_C0
@@ -110,10 +110,10 @@ class GaussianModel(nn.Module):
             raise TypeError(f"colors: expected floating point values, got {colors.dtype}")
         if points.ndim != 2 or points.shape[1] != 3 or colors.shape != points.shape:
             shapes = f"{tuple(points.shape)} and {tuple(colors.shape)}"
-            raise ArgumentError(f"points, colors: expected two of shape (N, 3), got {shapes}")
+            raise ArgumentError("points, colors", "two of shape (N, 3)", shapes)
         for name, value in (("points", points), ("colors", colors)):
             if not bool(value.isfinite().all()):
-                raise ArgumentError(f"{name}: expected finite numbers, got NaN or infinity")
+                raise ArgumentError(name, "finite numbers", "NaN or infinity")
         _check_degree(sh_degree, MAX_SH_DEGREE)
         points = points.detach()
         n = len(points)
@@ -126,6 +126,10 @@ class GaussianModel(nn.Module):
             sh_rest=points.new_zeros(n, SH_SIZES[sh_degree] - 1, 3),
         )
 
+    def per_gaussian(self) -> dict[str, nn.Parameter]:
+        """The parameters with a row for each Gaussian, by name: those of the class, and none that was added to it."""
+        return {name: self.get_parameter(name) for name in PARAMETERS}
+
     def select(self, rows: Tensor, sh_degree: int | None = None) -> "GaussianModel":
         """A new model of the Gaussians at `rows`: a mask `(N,)` or indices `(M,)`.
 
@@ -133,9 +137,9 @@ class GaussianModel(nn.Module):
         another length.
         """
         if rows.dtype == torch.bool and rows.shape != (len(self),):
-            raise ArgumentError(f"rows: expected a mask of shape ({len(self)},), got {tuple(rows.shape)}")
+            raise ArgumentError("rows", f"a mask of shape ({len(self)},)", tuple(rows.shape))
         degree = self.max_sh_degree if sh_degree is None else _check_degree(sh_degree, self.max_sh_degree)
-        values = {name: parameter.detach()[rows] for name, parameter in self.named_parameters()}
+        values = {name: parameter.detach()[rows] for name, parameter in self.per_gaussian().items()}
         values["sh_rest"] = values["sh_rest"][:, : SH_SIZES[degree] - 1]
         return GaussianModel(**values, sh_degree=min(degree, self.sh_degree), antialiased=self.antialiased)
 
@@ -216,7 +220,7 @@ def _check_dtype(name: str, value: Tensor) -> None:
 def _check_degree(value: int, highest: int) -> int:
     """The degree as an int; a ValueError if it is not one from 0 to the highest."""
     if not isinstance(value, int | np.integer) or not 0 <= value <= highest:
-        raise ArgumentError(f"sh_degree: expected an integer from 0 to {highest}, got {value!r}")
+        raise ArgumentError("sh_degree", f"an integer from 0 to {highest}", quoted(value))
     return int(value)
 
 
@@ -227,9 +231,9 @@ def _check_shapes(values: Sequence[Tensor]) -> int:
     n = means.shape[0] if means.ndim else 0
     k = sh_rest.shape[1] + 1 if sh_rest.ndim == 3 else 0
     if k not in SH_SIZES:
-        raise ArgumentError(f"sh_rest: expected shape ({n}, K - 1, 3) with K in {SH_SIZES}, got {tuple(sh_rest.shape)}")
+        raise ArgumentError("sh_rest", f"shape ({n}, K - 1, 3) with K in {SH_SIZES}", tuple(sh_rest.shape))
     shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, 1, 3), (n, k - 1, 3))
     for name, value, shape in zip(PARAMETERS, values, shapes, strict=True):
         if tuple(value.shape) != shape:
-            raise ArgumentError(f"{name}: expected shape {shape}, got {tuple(value.shape)}")
+            raise ArgumentError(name, f"shape {shape}", tuple(value.shape))
     return SH_SIZES.index(k)

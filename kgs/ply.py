@@ -19,7 +19,7 @@ from torch import Tensor
 
 from kgs import packed_ply
 from kgs._support.checks import check_kind
-from kgs._support.errors import ArgumentError, DataError, warn
+from kgs._support.errors import ArgumentError, DataError, quoted, warn
 from kgs._support.json_files import write_whole
 from kgs.geometry.types import SH_SIZES
 from kgs.model import MAX_SH_DEGREE, GaussianModel
@@ -63,7 +63,7 @@ def save_ply(
     """
     check_kind("model", model, GaussianModel)
     bands = SH_SIZES[_degree_of_file(sh_degree, model)] - 1
-    values = {name: parameter.detach().cpu().numpy() for name, parameter in model.named_parameters()}
+    values = {name: parameter.detach().cpu().numpy() for name, parameter in model.per_gaussian().items()}
     means = values["means"].astype(np.float64)
     if offset is not None:  # adding zeros instead would lose the sign of -0.0
         means += as_vector("offset", offset)
@@ -84,7 +84,7 @@ def save_ply(
     invalid = _invalid(table, names).any(axis=0)
     if invalid.any():
         raise ArgumentError(
-            f"model: expected values that are finite in float32, got NaN or infinity in {names[invalid.argmax()]}"
+            "model", "values that are finite in float32", f"NaN or infinity in {names[invalid.argmax()]}"
         )
     position = "float"
     if float32_moves(means, values["log_scales"]):
@@ -144,11 +144,11 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
                 columns = _read_columns(path, header, file, vertex)
     except OSError as error:
         if path.is_dir():
-            meant = f": its splat is {path / 'splat.ply'}" if (path / "splat.ply").is_file() else ""
-            raise DataError(path, "", f"cannot be read: expected a PLY file, got a folder{meant}") from error
-        raise DataError(path, "", f"cannot be read: {error.strerror or error}") from error
+            meant = f"its splat is {path / 'splat.ply'}" if (path / "splat.ply").is_file() else ""
+            raise DataError(path, "", "a PLY file", "a folder", advice=meant) from error
+        raise DataError(path, "", "a file that can be read", advice=error.strerror or str(error)) from error
     except MemoryError as error:
-        raise DataError(path, "vertex", f"expected as many as fit into memory, got {vertex.count}") from error
+        raise DataError(path, "vertex", "as many as fit into memory", vertex.count) from error
     names = [*"xyz", *_properties_after_normals(rest)]
     means = np.stack([columns[name].astype(np.float64) for name in "xyz"], axis=1) - shift
     with np.errstate(over="ignore"):
@@ -159,7 +159,7 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
         reasons = _why_left_out(table, kept)
         if not kept.any():
             rows = "1 row that is none" if len(table) == 1 else f"{len(table)} rows that are none"
-            raise DataError(path, "vertex", f"expected at least one Gaussian, got {rows}: {reasons}")
+            raise DataError(path, "vertex", "at least one Gaussian", rows, advice=reasons)
         warn(f"{path}: {int((~kept).sum())} of {len(table)} Gaussians are left out: {reasons}")
         table = table[kept]
         means = means[kept]
@@ -184,9 +184,9 @@ def as_vector(name: str, value: Tensor) -> NDArray[np.float64]:
     """A vector of three finite numbers as float64; a ValueError that names the argument if it is none."""
     vector: NDArray[np.float64] = torch.as_tensor(value, dtype=torch.float64, device="cpu").detach().numpy()
     if vector.shape != (3,):
-        raise ArgumentError(f"{name}: expected shape (3,), got {vector.shape}")
+        raise ArgumentError(name, "shape (3,)", vector.shape)
     if not np.isfinite(vector).all():
-        raise ArgumentError(f"{name}: expected finite numbers, got {vector.tolist()}")
+        raise ArgumentError(name, "finite numbers", vector.tolist())
     return vector
 
 
@@ -213,7 +213,7 @@ def _rows_of_gaussians(path: Path, table: NDArray[np.float32], names: list[str])
     is_valid = np.logical_not(invalid.any(axis=1))
     if 2 * int(is_valid.sum()) <= len(table) and len(table):
         row, column = np.argwhere(invalid)[0]
-        raise DataError(path, names[column], f"expected finite float32 values, got {table[row, column]} in row {row}")
+        raise DataError(path, names[column], "finite float32 values", f"{table[row, column]} in row {row}")
     rows: NDArray[np.bool_] = is_valid & table[:, -4:].any(axis=1)
     return rows
 
@@ -233,7 +233,7 @@ def _degree_of_file(sh_degree: int | None, model: GaussianModel) -> int:
         return minimum
     if not isinstance(sh_degree, int | np.integer) or not minimum <= sh_degree <= MAX_SH_DEGREE:
         expected = f"an integer from {minimum}, the model's, to {MAX_SH_DEGREE}"
-        raise ArgumentError(f"sh_degree: expected {expected}, got {sh_degree!r}")
+        raise ArgumentError("sh_degree", expected, quoted(sh_degree))
     return int(sh_degree)
 
 
@@ -284,7 +284,7 @@ def _find(path: Path, header: _Header, name: str) -> _Element:
     """The one element of this name."""
     found = [element for element in header.elements if element.name == name]
     if len(found) != 1:
-        raise DataError(path, name, f"expected one element of that name, got {len(found)}")
+        raise DataError(path, name, "one element of that name", len(found))
     return found[0]
 
 
@@ -292,7 +292,7 @@ def _count_harmonics(path: Path, element: _Element) -> int:
     """The number of properties f_rest."""
     count = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in element.codes)
     if count not in _REST_COUNTS:
-        raise DataError(path, "f_rest", f"expected {_REST_COUNTS} properties of that name, got {count}")
+        raise DataError(path, "f_rest", f"{_REST_COUNTS} properties of that name", count)
     return count
 
 
@@ -300,7 +300,7 @@ def _check_properties(path: Path, element: _Element, names: list[str]) -> None:
     """Raise a DataError where an element lacks a property."""
     for name in names:
         if name not in element.codes:
-            raise DataError(path, name, "expected this property of a splat, got none")
+            raise DataError(path, name, "this property of a splat", "none")
 
 
 def _read_packed(path: Path, header: _Header, file: BinaryIO) -> dict[str, NDArray[np.generic]]:
@@ -311,14 +311,14 @@ def _read_packed(path: Path, header: _Header, file: BinaryIO) -> dict[str, NDArr
     _check_properties(path, chunk, packed_ply.BOUNDS)
     expected = -(-vertex.count // packed_ply.CHUNK)
     if chunk.count != expected:
-        raise DataError(path, "chunk", f"expected {expected} for {vertex.count} Gaussians, got {chunk.count}")
+        raise DataError(path, "chunk", f"{expected} for {vertex.count} Gaussians", chunk.count)
     harmonics: dict[str, NDArray[np.generic]] = {}
     start = file.tell()
     if any(element.name == "sh" for element in header.elements):
         sh = _find(path, header, "sh")
         _check_properties(path, sh, [f"f_rest_{i}" for i in range(_count_harmonics(path, sh))])
         if sh.count != vertex.count:
-            raise DataError(path, "sh", f"expected {vertex.count} as vertices, got {sh.count}")
+            raise DataError(path, "sh", f"{vertex.count} as vertices", sh.count)
         harmonics = _read_columns(path, header, file, sh)
         file.seek(start)
     ranges = _read_columns(path, header, file, chunk)
@@ -329,13 +329,13 @@ def _read_packed(path: Path, header: _Header, file: BinaryIO) -> dict[str, NDArr
 def _read_header(path: Path, file: BinaryIO) -> _Header:
     """Read the header; the file is then at the first byte of the data."""
     if file.readline(8).rstrip(b"\r\n") != b"ply":
-        raise DataError(path, "", "not a PLY file: expected 'ply' in the first line")
+        raise DataError(path, "", "a PLY file", "one without 'ply' in the first line")
     header = _Header()
     elements = header.elements
     while True:
         line = file.readline(MAX_HEADER)
         if not line.endswith(b"\n") or file.tell() > MAX_HEADER:
-            raise DataError(path, "header", f"expected end_header within {MAX_HEADER} bytes")
+            raise DataError(path, "header", f"end_header within {MAX_HEADER} bytes")
         match line.decode("ascii", "replace").split():
             case ["end_header"]:
                 break
@@ -353,9 +353,9 @@ def _read_header(path: Path, file: BinaryIO) -> _Header:
                 pass
             case _:
                 text = line[:80].decode("ascii", "backslashreplace").rstrip()
-                raise DataError(path, "header", f"expected a line of a PLY header, got {text!r}")
+                raise DataError(path, "header", "a line of a PLY header", quoted(text))
     if not header.format:
-        raise DataError(path, "format", f"expected one of {sorted(BYTE_ORDERS)}, got none")
+        raise DataError(path, "format", f"one of {sorted(BYTE_ORDERS)}", "none")
     return header
 
 
@@ -367,7 +367,7 @@ def _read_columns(path: Path, header: _Header, file: BinaryIO, element: _Element
     index = header.elements.index(element)
     dtypes = [_row_dtype(each, BYTE_ORDERS[header.format]) for each in header.elements]
     if any(dtype.hasobject for dtype in dtypes[: index + 1]):
-        raise DataError(path, element.name, "expected no list property in it or before it, got one")
+        raise DataError(path, element.name, "no list property in it or before it", "one")
     is_text = header.format == "ascii"
     data_start = file.tell()
     widths = [len(dtype.names or ()) if is_text else dtype.itemsize for dtype in dtypes]
@@ -383,7 +383,7 @@ def _read_columns(path: Path, header: _Header, file: BinaryIO, element: _Element
     has_lists = any(dtype.hasobject for dtype in dtypes)  # behind the vertices: then the total is not known
     if available < end or (available != total and not has_lists):
         unit = "numbers" if is_text else "bytes"
-        raise DataError(path, element.name, f"expected {total} {unit} after the header, got {available}")
+        raise DataError(path, element.name, f"{total} {unit} after the header", available)
     if is_text:
         table = numbers[start:end].reshape(element.count, widths[index])
         return dict(zip(element.codes, table.T, strict=True))
@@ -403,4 +403,4 @@ def _read_numbers(path: Path, file: BinaryIO) -> NDArray[np.float64]:
         try:
             return np.fromfile(file, np.float64, sep=" ")
         except (DeprecationWarning, ValueError) as error:
-            raise DataError(path, "vertex", "expected nothing but numbers after the header") from error
+            raise DataError(path, "vertex", "nothing but numbers after the header") from error

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from kgs._support.checks import check_kind, check_tensor
-from kgs._support.errors import ArgumentError
+from kgs._support.errors import ArgumentError, quoted
 
 from .backends import check_backend, choose
 from .geometry.cameras import Cameras
@@ -108,7 +108,7 @@ class GaussianRenderer(nn.Module):
                 backend that is named does not cover the call.
         """
         if isinstance(outputs, str) or not (outputs := tuple(outputs)) or set(outputs) - set(_OUTPUTS):
-            raise ArgumentError(f"outputs: expected some of {_OUTPUTS}, got {outputs!r}")
+            raise ArgumentError("outputs", f"some of {_OUTPUTS}", quoted(outputs))
         check_kind("gaussians", gaussians, Gaussians)
         opacities = self.opacity_layer(gaussians.opacities)
         if opacities is not gaussians.opacities:
@@ -162,6 +162,6 @@ def blend(
     if shape in (full[1:2], full[:2]):
         background = background.reshape(*shape, 1, 1)
     elif shape not in (full[1:], full):
-        raise ArgumentError(f"{name}: expected shape {full[1:2]}, {full[:2]}, {full[1:]} or {full}, got {shape}")
+        raise ArgumentError(name, f"shape {full[1:2]}, {full[:2]}, {full[1:]} or {full}", shape)
     chosen = choose(backend, "blending", image.device, lambda candidate: candidate.covers(image))
     return chosen.blend(image, transmittance, background)

@@ -78,7 +78,7 @@ def project(
     count = cameras.extrinsics.shape[0]
     shape = tuple(gaussians.opacities.shape)
     if shape[:-1] not in ((), (count,)):
-        raise ArgumentError(f"opacities: expected shape ({n},) or ({count}, {n}) for {count} cameras, got {shape}")
+        raise ArgumentError("opacities", f"shape ({n},) or ({count}, {n}) for {count} cameras", shape)
     cameras = with_constant_last_rows(cameras)
     device = gaussians.means.device
     chosen = choose(backend, "projection", device, lambda candidate: candidate.covers(gaussians.means))
@@ -147,7 +147,7 @@ def composite(
     """
     options = raster_options(options, {})
     if chunk_size is not None and (not isinstance(chunk_size, int | np.integer) or chunk_size < 1):
-        raise ArgumentError(f"chunk_size: expected an integer >= 1 or None, got {chunk_size}")
+        raise ArgumentError("chunk_size", "an integer >= 1 or None", chunk_size)
     if not isinstance(projected, ProjectedGaussians):
         raise TypeError(f"projected: expected kgs.ProjectedGaussians, got {type(projected).__name__}")
     call = CompositingCall(projected, features, options, median_depth, chunk_size)
@@ -198,24 +198,24 @@ def _check_projected(projected: ProjectedGaussians, features: Tensor) -> None:
     like = projected.means2d
     if features.ndim != 2 or len(features) != m:
         got = tuple(features.shape)
-        raise ArgumentError(f"features: expected shape ({m}, F), a row per projected Gaussian, got {got}")
+        raise ArgumentError("features", f"shape ({m}, F), a row per projected Gaussian", got)
     values = {name: getattr(projected, name) for name in ("means2d", "factors", "opacities", "depths")}
     shapes = {"means2d": (m, 2), "factors": (m, 2, 3), "opacities": (m,), "depths": (m,), "features": features.shape}
     for name, value in (values | {"features": features}).items():
         check_tensor(name, value, like, " as means2d")
         if tuple(value.shape) != tuple(shapes[name]):
-            raise ArgumentError(f"{name}: expected shape {shapes[name]}, got {tuple(value.shape)}")
+            raise ArgumentError(name, f"shape {shapes[name]}", tuple(value.shape))
     ids = projected.camera_ids
     if ids.dtype != torch.int64 or ids.device != like.device:
         raise TypeError(f"camera_ids: expected int64 on {like.device}, got {ids.dtype} on {ids.device}")
     if tuple(ids.shape) != (m,):
-        raise ArgumentError(f"camera_ids: expected shape {(m,)}, got {tuple(ids.shape)}")
+        raise ArgumentError("camera_ids", f"shape {(m,)}", tuple(ids.shape))
     if m and ids.device.type == "cpu" and not torch.compiler.is_compiling():  # on a GPU this would synchronise
         first = int(np.min(ids.numpy()))
         last = int(np.max(ids.numpy()))
         if first < 0 or last >= projected.num_cameras:
             wrong = first if first < 0 else last
-            raise ArgumentError(f"camera_ids: expected 0 to {projected.num_cameras - 1}, got {wrong}")
+            raise ArgumentError("camera_ids", f"0 to {projected.num_cameras - 1}", wrong)
 
 
 class _Composite(torch.autograd.Function):

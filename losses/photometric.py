@@ -103,17 +103,15 @@ def photometric_loss(
         raise TypeError(f"moments: expected TargetMoments, got {type(moments).__name__}")
     if moments is not None and not _belong_to(moments, image):
         given = tuple(moments.padded.shape)
-        raise ArgumentError(f"moments: expected those of a target like image, {tuple(image.shape)}, got {given} padded")
+        raise ArgumentError("moments", f"those of a target like image, {tuple(image.shape)}", f"{given} padded")
     if isinstance(target, TargetMoments):
         target = target.padded[..., RADIUS:-RADIUS, RADIUS:-RADIUS].reshape(image.shape)
     _check_images(image, target)
     if not (math.isfinite(dssim_weight) and dssim_weight >= 0.0):
-        raise ArgumentError(f"dssim_weight: expected a finite number >= 0, got {dssim_weight}")
+        raise ArgumentError("dssim_weight", "a finite number >= 0", dssim_weight)
     outside = None if mask is None else _outside(mask, image)
     if dssim_weight != 0.0 and min(shape[-2:]) <= RADIUS:
-        raise ArgumentError(
-            f"image: expected at least {RADIUS + 1} x {RADIUS + 1} pixels, got {shape[-2]} x {shape[-1]}"
-        )
+        raise ArgumentError("image", f"at least {RADIUS + 1} x {RADIUS + 1} pixels", f"{shape[-2]} x {shape[-1]}")
     fast = fast and not target.requires_grad
     chosen = choose(backend, "loss", image.device, lambda candidate: candidate.covers(image))
     if not chosen.has_loss or not fast or outside is not None or dssim_weight == 0.0 or min(shape[-2:]) < WINDOW:
@@ -136,7 +134,7 @@ def target_moments(target: Tensor, *, backend: str = "torch") -> TargetMoments:
     check_backend(backend)
     _check_images(target, target)
     if min(target.shape[-2:]) <= RADIUS:
-        raise ArgumentError(f"target: expected at least {RADIUS + 1} x {RADIUS + 1} pixels, got {tuple(target.shape)}")
+        raise ArgumentError("target", f"at least {RADIUS + 1} x {RADIUS + 1} pixels", tuple(target.shape))
     padded = F.pad(target.reshape(1, -1, *target.shape[-2:]), BORDER, mode="reflect")
     chosen = choose(backend, "loss", target.device, lambda candidate: candidate.covers(target))
     if chosen.has_moments and min(target.shape[-2:]) >= WINDOW:
@@ -267,12 +265,12 @@ def _outside(mask: Tensor, image: Tensor) -> Tensor:
     size = tuple(image.shape[-2:])
     shape = tuple(mask.shape) if isinstance(mask, Tensor) else type(mask).__name__
     if shape not in (size, (1, *size), (1, 1, *size), (images, 1, *size)):
-        raise ArgumentError(f"mask: expected shape {size}, {(1, *size)} or {(images, 1, *size)}, got {shape}")
+        raise ArgumentError("mask", f"shape {size}, {(1, *size)} or {(images, 1, *size)}", shape)
     outside = mask == 0
     if not bool((outside | (mask == 1)).all()):
-        raise ArgumentError("mask: expected True and False, or 0 and 1; for other values write mask > 0.5")
+        raise ArgumentError("mask", "True and False, or 0 and 1; for other values write mask > 0.5")
     if bool(outside.all()):
-        raise ArgumentError("mask: expected at least one pixel that counts, got none")
+        raise ArgumentError("mask", "at least one pixel that counts", "none")
     return outside.expand(images, 1, *size)
 
 
@@ -322,6 +320,6 @@ def _check_images(image: Tensor, target: Tensor) -> None:
         expected = f"{image.dtype} on {image.device}"
         raise TypeError(f"target: expected {expected} as image, got {target.dtype} on {target.device}")
     if image.ndim != 4 or image.numel() == 0:
-        raise ArgumentError(f"image: expected shape (B, C, H, W), each at least 1, got {tuple(image.shape)}")
+        raise ArgumentError("image", "shape (B, C, H, W), each at least 1", tuple(image.shape))
     if target.shape != image.shape:
-        raise ArgumentError(f"target: expected shape {tuple(image.shape)} as image, got {tuple(target.shape)}")
+        raise ArgumentError("target", f"shape {tuple(image.shape)} as image", tuple(target.shape))

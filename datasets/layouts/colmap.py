@@ -38,7 +38,7 @@ def load_colmap(root: Path, photo_folder: str = "") -> FrameSet:
     ids = {}
     for (image_id, image), pose in zip(registered.images.items(), registered.poses, strict=True):
         if image.camera_id not in cameras:
-            raise DataError(images_file, image.name, f"has camera {image.camera_id}, which {cameras_file.name} lacks")
+            raise DataError(images_file, image.name, f"a camera of {cameras_file.name}", image.camera_id)
         path = find_file(images_file, root, image.name, photos)
         if not path.is_file() and not photo_folder:
             beside = find_file(images_file, root, image.name)

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from kgs._support.errors import DataError
+from kgs._support.errors import DataError, quantity, quoted
 from kgs.datasets.image_file import read_bytes
 
 T = TypeVar("T")
@@ -74,7 +74,7 @@ def model_file(folder: Path, stem: str) -> Path:
     for suffix in [*whole, *_SUFFIXES]:
         if (folder / f"{stem}.{suffix}").is_file():
             return folder / f"{stem}.{suffix}"
-    raise DataError(folder, "", f"expected {stem}.bin or {stem}.txt, found neither")
+    raise DataError(folder, "", f"{stem}.bin or {stem}.txt", "neither")
 
 
 def read_cameras(path: Path) -> dict[int, ColmapCamera]:
@@ -91,8 +91,8 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
         for line in filter(None, _lines(path)):
             kinds = (int, str, int, int, partial(_numbers, float))
             camera_id, model, width, height, params = _fields(path, line, kinds)
-            if len(params) != _parameter_count(path, camera_id, model):
-                raise DataError(path, f"camera {camera_id}", f"{len(params)} parameters do not fit {model}")
+            if len(params) != (count := _parameter_count(path, camera_id, model)):
+                raise DataError(path, f"camera {camera_id}", f"{count} parameters of {model}", len(params))
             _add(path, "camera", cameras, camera_id, ColmapCamera(model, width, height, params))
     return cameras
 
@@ -168,14 +168,15 @@ def read_points(path: Path, image_ids: set[int]) -> tuple[NDArray[np.float64], N
         if len(image_ids.intersection(track[::2])) >= 2:
             rows.append(row)
     if 0 < count == without_track:
-        wanted = "expected points with a track (the photos that observe them)"
-        raise DataError(path, "", f"{wanted}, got {count} without, as LiDAR gives them: use --init file with them")
+        got = f"{count} without, as LiDAR gives them"
+        advice = "use --init file with them"
+        raise DataError(path, "", "points with a track (the photos that observe them)", got, advice=advice)
     points = np.array([row[:3] for row in rows], np.float64).reshape(-1, 3)
     if not np.isfinite(points).all():
-        raise DataError(path, "", "expected finite positions, got NaN or infinity")
+        raise DataError(path, "", "finite positions", "NaN or infinity")
     colors = [value for row in rows for value in row[3:]]
     if not 0 <= min(colors, default=0) <= max(colors, default=0) <= 255:  # integers in a text file have no limit
-        raise DataError(path, "", f"expected colours from 0 to 255, got {min(colors)} to {max(colors)}"[:200])
+        raise DataError(path, "", "colours from 0 to 255", f"{min(colors)} to {max(colors)}"[:200])
     return points, np.array([row[3:] for row in rows], np.uint8).reshape(-1, 3)
 
 
@@ -217,21 +218,21 @@ class _Binary:
         """Loop as often as the next count says; after the last item the file has to end."""
         yield from range(self.count(what, min_bytes))
         if self._at != len(self._data):
-            raise DataError(self._path, "", f"{len(self._data) - self._at} bytes are left over")
+            raise DataError(self._path, "", f"{self._at} bytes", len(self._data))
 
     def string(self, what: str) -> str:
         if (end := self._data.find(b"\0", self._at, self._at + _LONGEST_NAME)) < 0:
-            raise DataError(self._path, what, "expected a name that ends with a zero byte")
+            raise DataError(self._path, what, "a name that ends with a zero byte")
         text = self._data[self._at : end]
         self._at = end + 1
         try:
             return text.decode("utf-8")
         except UnicodeDecodeError as error:
-            raise DataError(self._path, what, f"expected a name in UTF-8, got {text!r}") from error
+            raise DataError(self._path, what, "a name in UTF-8", quoted(text)) from error
 
     def _need(self, size: int, what: str) -> None:
         if size > (left := len(self._data) - self._at):
-            raise DataError(self._path, what, f"needs {size} bytes at byte {self._at}, the file has {left} more")
+            raise DataError(self._path, what, f"{size} bytes at byte {self._at}", left)
 
 
 def _kind(word: str) -> int:
@@ -257,13 +258,12 @@ class _Line:
         try:
             return tuple(_WORDS[code](word) for code, word in zip(codes, words, strict=True))
         except ValueError as error:
-            reason = f"expected a line as COLMAP writes it, got {self._line[:60]!r}"
-            raise DataError(self._path, what, reason) from error
+            raise DataError(self._path, what, "a line as COLMAP writes it", quoted(self._line)) from error
 
     def end(self) -> None:
         """The line has to end here."""
         if left := list(self._words):
-            raise DataError(self._path, f"line {self._line[:60]!r}", f"{len(left)} words are left over")
+            raise DataError(self._path, f"line {quoted(self._line)}", "its end", quantity(len(left), "more word"))
 
 
 def _records(path: Path, what: str, min_bytes: int) -> Iterator[_Binary | _Line]:
@@ -289,7 +289,7 @@ def _lines(path: Path) -> Iterator[str]:
     try:
         text = read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise DataError(path, "", "expected text in UTF-8") from error
+        raise DataError(path, "", "text in UTF-8") from error
     return (line.strip() for line in text.split("\n") if not line.startswith("#"))
 
 
@@ -299,7 +299,7 @@ def _fields(path: Path, line: str, kinds: Sequence[Callable[[str], Any]]) -> lis
     try:
         return [kind(word) for kind, word in zip(kinds, (*words, "")[: len(kinds)], strict=True)]
     except ValueError as error:
-        raise DataError(path, f"line {line[:60]!r}", f"expected {len(kinds)} fields as COLMAP writes them") from error
+        raise DataError(path, f"line {quoted(line)}", f"{len(kinds)} fields as COLMAP writes them") from error
 
 
 def _numbers(kind: type[T], text: str) -> tuple[T, ...]:
@@ -319,11 +319,11 @@ def _parameter_count(path: Path, camera_id: int, model: str) -> int:
     if count := _MODELS.get(model):
         return count
     known = ", ".join(name for name, count in _MODELS.items() if count)
-    reason = f"camera model {model} cannot be read, only {known}: undistort the photos with colmap image_undistorter"
-    raise DataError(path, f"camera {camera_id}", reason)
+    advice = "undistort the photos with colmap image_undistorter"
+    raise DataError(path, f"camera {camera_id}", f"one of the models {known}", model, advice=advice)
 
 
 def _add(path: Path, what: str, table: dict[int, T], key: int, value: T) -> None:
     if key in table:
-        raise DataError(path, f"{what} {key}", "occurs twice")
+        raise DataError(path, f"{what} {key}", "it once", "it twice")
     table[key] = value

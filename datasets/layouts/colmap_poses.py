@@ -90,24 +90,22 @@ def _poses_of_frames(
     gone = 0
     for frame_id, frame in frames.items():
         if frame.rig_id not in rigs:
-            raise DataError(frames_file, f"frame {frame_id}", f"has rig {frame.rig_id}, which {rigs_file.name} lacks")
+            raise DataError(frames_file, f"frame {frame_id}", f"a rig of {rigs_file.name}", frame.rig_id)
         for image_id, camera_id in frame.cameras.items():
             if image_id not in images:  # it was taken out of the model
                 gone += 1
                 continue
             name = images[image_id].name
             if image_id in rig_poses:
-                raise DataError(frames_file, name, "expected each image in one frame, got it in two")
+                raise DataError(frames_file, name, "each image in one frame", "it in two")
             if (pose := rigs[frame.rig_id].get(camera_id)) is None:
-                reason = f"expected the pose of camera {camera_id} in rig {frame.rig_id}, got none"
-                raise DataError(rigs_file, name, reason)
+                raise DataError(rigs_file, name, f"the pose of camera {camera_id} in rig {frame.rig_id}", "none")
             rig_poses[image_id] = (f"frame {frame_id}", frame.pose)
             camera_poses[image_id] = (f"rig {frame.rig_id}", pose)
             other_cameras += camera_id != images[image_id].camera_id
     if lacking := [image.name for image_id, image in images.items() if image_id not in rig_poses]:
-        reason = f"expected each image in a frame, got {len(lacking)} in none"
         advice = f"where the poses in images.* are right, remove {frames_file.name} and {rigs_file.name}"
-        raise DataError(frames_file, lacking[0], f"{reason}: {advice}")
+        raise DataError(frames_file, lacking[0], "each image in a frame", f"{len(lacking)} in none", advice=advice)
     camera_from_rig = _matrices(rigs_file, [camera_poses[image_id] for image_id in images])
     rig_from_world = _matrices(frames_file, [rig_poses[image_id] for image_id in images])
     return camera_from_rig @ rig_from_world, other_cameras, gone
@@ -123,7 +121,7 @@ def _matrices(source: Path, poses: Sequence[tuple[str, ColmapPose]]) -> Tensor:
     matrices = kg.Rt_to_matrix4x4(kg.quaternion_to_rotation_matrix(quats), translations)
     for (what, _), is_valid in zip(poses, quats.any(dim=1) & matrices.isfinite().all(dim=(1, 2)), strict=True):
         if not is_valid:
-            raise DataError(source, what, "expected a finite 4x4 pose")
+            raise DataError(source, what, "a finite 4x4 pose")
     return matrices
 
 

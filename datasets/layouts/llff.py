@@ -30,10 +30,10 @@ def load_llff(root: Path, photo_folder: str = "") -> FrameSet:
     folder = image_folder(root, photo_folder)
     rows = _read_rows(source)
     if folder is None:
-        raise DataError(root, "", "expected the photos in images/ or images_k/, found neither folder")
+        raise DataError(root, "", "the photos in images/ or images_k/", "neither folder")
     paths = [path_inside(source, root, path.name, folder) for path in list_images(folder)]
     if len(paths) != len(rows):
-        raise DataError(source, "", f"has {len(rows)} poses, but {folder.name}/ has {len(paths)} images")
+        raise DataError(source, "", f"{len(paths)} poses, for the images of {folder.name}/", len(rows))
     frames = [_frame(source, path, row) for path, row in zip(paths, rows, strict=True)]
     if not find_models(root):
         return FrameSet(frames)
@@ -46,16 +46,16 @@ def _read_rows(path: Path) -> NDArray[np.float64]:
     try:
         rows = np.load(path, mmap_mode="r", allow_pickle=False)
     except Exception as error:  # numpy parses the header as Python source: damaged bytes raise whatever that raises
-        raise DataError(path, "", f"is not an array that numpy can read ({error})") from error
+        raise DataError(path, "", "an array that NumPy can read", advice=str(error)) from error
     if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind != "f":
         got = f"{rows.dtype} {rows.shape}" if isinstance(rows, np.ndarray) else type(rows).__name__
-        raise DataError(path, "", f"expected floating point numbers of shape (N, 17), got {got}")
+        raise DataError(path, "", "floating point numbers of shape (N, 17)", got)
     rows = np.array(rows, dtype=np.float64)
     infinite = ~np.isfinite(rows[:, :15]).all(axis=1)
     no_size = (rows[:, [4, 9]] < 1).any(axis=1) | (rows[:, [4, 9]] % 1).any(axis=1)
     for name, wrong in (("finite numbers", infinite), ("a height and width of whole pixels", no_size)):
         if wrong.any():
-            raise DataError(path, f"row {int(wrong.argmax())}", f"expected {name}")
+            raise DataError(path, f"row {int(wrong.argmax())}", name)
     return rows
 
 
@@ -79,4 +79,4 @@ def _model_points(folder: Path, frames: Sequence[Frame], train: Sequence[Frame])
         if bool((difference[:, :3] < 1e-3).all()) and bool((difference[:, 3] <= 1e-3 * span).all()):
             ids = {frame.name: images[row][0] for row, frame in zip(order, frames, strict=True)}
             return track_points(folder, {ids[frame.name] for frame in train})
-    raise DataError(folder, "points", "model-points are not available: the model's poses are not those of the scene")
+    raise DataError(folder, "points", "the poses of the scene, for model-points", "others")

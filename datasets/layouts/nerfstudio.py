@@ -14,7 +14,7 @@ import kornia.geometry as kg
 import torch
 from torch import Tensor
 
-from kgs._support.errors import DataError, quantity
+from kgs._support.errors import DataError, quantity, quoted
 from kgs._support.json_files import is_number, read_json
 from kgs.datasets.folders import IMAGE_SUFFIXES
 from kgs.datasets.frames import Frame, FrameSet, find_file, path_inside
@@ -67,7 +67,7 @@ def load_nerfstudio(root: Path) -> FrameSet:
     if lists["train"] and not held_out:
         held_out = [frame for frame in frames if frame not in train]
     if not train or (lists["train"] and not held_out):
-        raise DataError(root / "transforms.json", "train_filenames", "expected views to train on and others to test on")
+        raise DataError(root / "transforms.json", "train_filenames", "views to train on and others to test on")
     if (unused := len(frames) - len(train) - len(held_out)) > 0:
         notes += (f"transforms.json: neither training nor test views: {quantity(unused, 'frame')}",)
     return FrameSet(train, held_out or None, notes=notes)
@@ -78,11 +78,11 @@ def _listed(root: Path, data: Object, key: str, frames: list[Frame]) -> list[Fra
     source = root / "transforms.json"
     names = data.get(key) or []
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise DataError(source, key, "expected a list of file names")
+        raise DataError(source, key, "a list of file names")
     by_name = {frame.name: frame for frame in frames}
     listed = sorted({_find_photo(source, root, name) for name in names})
     if unknown := [name for name in listed if name not in by_name]:
-        raise DataError(source, key, f"expected names of frames, got {unknown[0][:200]!r}")
+        raise DataError(source, key, "names of frames", quoted(unknown[0]))
     return [by_name[name] for name in listed]
 
 
@@ -99,7 +99,7 @@ def read_transforms(root: Path, name: str) -> tuple[list[Frame], Object, tuple[s
     data = read_json(source := root / name, finite=False)  # `is_number` refuses what is not finite, where it is used
     entries = data.get("frames")
     if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
-        raise DataError(source, "frames", "expected a list of objects, not empty")
+        raise DataError(source, "frames", "a list of objects, not empty")
     split = {f"{part}_filenames" for part in ("train", "val", "test")} if name == "transforms.json" else set[str]()
     top = {key: data[key] for key in data.keys() - split}
     notes = _check_keys(source, [ChainMap(top), *(ChainMap(entry, data) for entry in entries)])
@@ -129,7 +129,7 @@ def _mask(source: Path, root: Path, values: Values) -> Mask | None:
         return None
     path = find_file(source, root, name)
     if not path.is_file():
-        raise DataError(source, _field("mask_path", values), f"expected a file, got {name[:200]!r}, which is not there")
+        raise DataError(source, _field("mask_path", values), "a file", f"{name[:200]!r}, which is not there")
     return Mask(ImageFile(path))
 
 
@@ -159,8 +159,7 @@ def _check_keys(source: Path, objects: Iterable[Values]) -> tuple[str, ...]:
             if key in known or _is_empty(value) or _is_harmless(key, value, values):
                 continue
             if _GEOMETRY.search(key) or key.endswith("_filenames"):
-                reason = f"cannot be used: expected none, 0 or false, got {_shown(value)}"
-                raise DataError(source, _field(key, values), reason)
+                raise DataError(source, _field(key, values), "none, 0 or false, kgs cannot use it", _shown(value))
             unused.add(key[:60])
     return (f"{source.name}: not used: {', '.join(sorted(unused)[:20])}",) if unused else ()
 
@@ -182,20 +181,20 @@ def _lens(source: Path, values: Values, size: tuple[int, ...]) -> Intrinsics:
     width = _number(source, "w", values, size[0])
     height = _number(source, "h", values, size[1])
     if not (width.is_integer() and height.is_integer()):
-        raise DataError(source, "w, h", f"expected whole numbers of pixels, got {width:g} and {height:g}")
+        raise DataError(source, "w, h", "whole numbers of pixels", f"{width:g} and {height:g}")
     fx = _focal(source, "x", values, width)
     fy = _focal(source, "y", values, height)
     fx = fy if fx is None else fx
     fy = fx if fy is None else fy
     if fx is None or fy is None:
-        raise DataError(source, "fl_x, camera_angle_x", "expected one of them, got none")
+        raise DataError(source, "fl_x, camera_angle_x", "one of them", "none")
     used = _KANNALA if fisheye else _BROWN
     frame = values.maps[0]
     of_this_lens = frame if {"camera_model", "is_fisheye"} & frame.keys() else values
     for key in _COEFFICIENTS:
         if key not in used and (value := _number(source, key, of_this_lens, 0.0)) != 0:
             kind = "a fisheye lens" if fisheye else "a lens that is not a fisheye, where tools disagree on its meaning"
-            raise DataError(source, _field(key, values), f"expected 0 for {kind}, got {value:g}")
+            raise DataError(source, _field(key, values), f"0 for {kind}", f"{value:g}")
     distortion = tuple(_number(source, key, values, 0.0) for key in used)
     cx = _number(source, "cx", values, width / 2)
     cy = _number(source, "cy", values, height / 2)
@@ -210,12 +209,11 @@ def _is_fisheye(source: Path, values: Values) -> bool:
     if "camera_make" in values and model not in known and not _OTHER_LENS.search(model):
         model = ""  # of the device, as in Exif
     if model not in ("", *known):
-        raise DataError(source, _field("camera_model", values), f"{model[:60]} cannot be read, only {', '.join(known)}")
+        raise DataError(source, _field("camera_model", values), f"one of {', '.join(known)}", quoted(model))
     if flag is not None and not (isinstance(flag, int) and flag in (0, 1)):
-        raise DataError(source, _field("is_fisheye", values), f"expected true or false, got {_shown(flag)}")
+        raise DataError(source, _field("is_fisheye", values), "true or false", _shown(flag))
     if flag is not None and model and bool(flag) != (model == _FISHEYE):
-        reason = f"is {str(bool(flag)).lower()}, but camera_model is {model}"
-        raise DataError(source, _field("is_fisheye", values), reason)
+        raise DataError(source, _field("is_fisheye", values), f"that of camera_model, {model}", str(bool(flag)).lower())
     return bool(flag) or model == _FISHEYE
 
 
@@ -227,20 +225,20 @@ def _focal(source: Path, axis: str, values: Values, length: float) -> float | No
         if (key := f"camera_angle_{axis}") in item:
             angle = _number(source, key, item, None)
             if not 0 < angle / 2 < math.pi / 2:
-                raise DataError(source, _field(key, item), f"expected an angle between 0 and pi, got {angle:g}")
+                raise DataError(source, _field(key, item), "an angle between 0 and pi", f"{angle:g}")
             return length / (2 * math.tan(angle / 2))
     return None
 
 
 def _number(path: Path, key: str, values: Mapping[str, Any], default: float | None) -> float:
     if not is_number(value := values.get(key, default)):
-        raise DataError(path, _field(key, values), f"expected a finite number, got {_shown(value)}")
+        raise DataError(path, _field(key, values), "a finite number", _shown(value))
     return float(value)
 
 
 def _text(path: Path, key: str, values: Mapping[str, Any], default: str | None) -> str:
     if not isinstance(value := values.get(key, default), str):
-        raise DataError(path, _field(key, values), f"expected a text, got {_shown(value)}")
+        raise DataError(path, _field(key, values), "a text", _shown(value))
     return value
 
 
@@ -252,23 +250,23 @@ def _field(key: str, values: Mapping[str, Any]) -> str:
 
 
 def _shown(value: Any) -> str:
-    return "none" if value is None else repr(value)[:60]
+    return "none" if value is None else quoted(value)
 
 
 def _opencv_pose(path: Path, frame: Object) -> Tensor:
     """A frame's `transform_matrix`, 4x4 or 3x4, as camera-to-world with OpenCV axes, `(4, 4)` float64."""
     rows = frame.get("transform_matrix")
     name = f"transform_matrix of {str(frame.get('file_path'))[:200]}"
-    expected = "expected a 4x4 matrix of finite numbers"
+    expected = "a 4x4 matrix of finite numbers"
     rows = rows if isinstance(rows, list) and all(isinstance(row, list) and len(row) == 4 for row in rows) else []
     rows = [*rows, [0, 0, 0, 1]] if len(rows) == 3 else rows
     if len(rows) != 4:
         raise DataError(path, name, expected)
     if wrong := [x for row in rows for x in row if not is_number(x)]:
-        raise DataError(path, name, f"{expected}, got {_shown(wrong[0])}")
+        raise DataError(path, name, expected, _shown(wrong[0]))
     matrix = torch.tensor([[float(x) for x in row] for row in rows], dtype=torch.float64)[None]
     last = matrix.new_tensor([0.0, 0.0, 0.0, 1.0])
     if float((matrix[0, 3] - last).abs().max()) > 1e-6:  # an inverse is off by rounding
-        raise DataError(path, name, f"expected the last row 0, 0, 0, 1, got {matrix[0, 3].tolist()}")
+        raise DataError(path, name, "the last row 0, 0, 0, 1", matrix[0, 3].tolist())
     matrix[0, 3] = last
     return kg.camtoworld_graphics_to_vision_4x4(matrix)[0]

@@ -52,7 +52,7 @@ def synthetic_scene(
         ("seed", seed, 0),
     ):
         if value < minimum:
-            raise ArgumentError(f"{name}: expected at least {minimum}, got {value}")
+            raise ArgumentError(name, f"at least {minimum}", value)
     world = _make_world(seed)
     train_eyes, test_eyes = _patch_eyes(train_views, test_views, np.random.default_rng([seed, 1]))
     with torch.device("cpu"):  # whatever torch's default is
@@ -79,7 +79,7 @@ def views_beyond(out: float, count: int = 6, size: tuple[int, int] = (126, 168),
         ValueError: a number is out of range.
     """
     if not 0.0 < out < np.inf or count < 1:
-        raise ArgumentError(f"out, count: expected a number > 0 and at least one camera, got {out} and {count}")
+        raise ArgumentError("out, count", "a number > 0 and at least one camera", f"{out} and {count}")
     return _views(_make_world(seed), room.EYE + out * _ellipse(count) * room.PATCH, size, "beyond")
 
 

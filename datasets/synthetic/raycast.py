@@ -42,7 +42,7 @@ def raycast(triangles: Array, intrinsics: Array, extrinsics: Array, size: tuple[
         Kornia's: world-to-camera extrinsics, OpenCV axes (x right, y down, z forward), integer pixel centres.
     """
     if triangles.ndim != 3 or triangles.shape[1:] != (3, 3):
-        raise ArgumentError(f"triangles: expected shape (F, 3, 3), got {triangles.shape}")
+        raise ArgumentError("triangles", "shape (F, 3, 3)", triangles.shape)
     faces = _project(triangles, intrinsics[:3, :3], extrinsics, size)
     depths = np.full(size, np.inf)
     nearest = np.full(size, -1, dtype=np.int64)

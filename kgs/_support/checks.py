@@ -31,7 +31,7 @@ def check_intrinsic_rows(name: str, matrices: list[list[list[float]]]) -> None:
         last_rows = [[float(i == j) for j in range(len(matrix))] for i in range(2, len(matrix))]
         if matrix[2:] != last_rows or any(value != 0.0 for row in matrix[:2] for value in row[3:]):
             why = "to resize the images, scale the first two rows alone: K[:2] /= factor"
-            raise ArgumentError(f"{name}: expected intrinsics with (0, 0, 1) as third row, got {matrix}; {why}")
+            raise ArgumentError(name, "intrinsics with (0, 0, 1) as third row", matrix, advice=why)
 
 
 def check_kind(name: str, value: Any, kind: type) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from os import PathLike
 
 _END = 160  # letters of each end of a long text
+_SHOWN = 60  # letters of a value
 
 
 def printable(text: object) -> str:
@@ -40,38 +41,84 @@ def warn(message: str, category: type[Warning] = UserWarning) -> None:
     warnings.warn(message, category, stacklevel=outside.index(True) + 1)
 
 
+def quoted(value: object) -> str:
+    """The value of a user or of a file as an error shows it: a text in quotes, others plainly; cut."""
+    return _cut(repr(value)) if isinstance(value, str | bytes) else _shown(value)
+
+
+def sentence(where: str, expected: str, got: str, advice: str) -> str:
+    """What an error says, "where: expected this, got that: do so". Only an advice may have several lines."""
+    fact = printable(f"{where}: expected {expected}{f', got {got}' if got else ''}")
+    return fact + "\n".join(map(printable, f": {advice}".split("\n"))) if advice else fact
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}..."
+
+
+def _shown(got: object) -> str:
+    return got if isinstance(got, str) else _cut(" ".join(str(got).split()))
+
+
 class ArgumentError(ValueError):
-    """An argument has another value than expected; the message begins with its name and a colon.
+    """An argument has another value than expected: "steps: expected at least 1, got 0".
 
     kgs raises it wherever it checks a value, and nothing else raises it. The class, not the text, so tells a mistake of
     the caller from one in the code: torch, NumPy and Python raise plain ValueErrors. A value of a wrong type is a
     TypeError, which no command line can bring about. `kgs.drop` and `kgs.reference`, which stand alone, raise plain
     ValueErrors too; commands check what they pass to them.
+
+    Args:
+        name: of the argument, or of several, as "near, far".
+        expected: what the argument has to be.
+        got: what it is, or "" where that says nothing. Words are shown as they are, other values as text of at most 60
+            letters; so is the attribute.
+        advice: why that is so, or what to do about it.
     """
+
+    def __init__(self, name: str, expected: str, got: object = "", *, advice: str = "") -> None:
+        self.name = name
+        self.expected = expected
+        self.got = _shown(got)
+        self.advice = advice
+        super().__init__(name, expected, self.got)
+
+    def __str__(self) -> str:
+        return sentence(self.name, self.expected, self.got, self.advice)
+
+    def about(self, path: str | PathLike[str], key: str | None = None) -> "DataError":
+        """The same about a file, in which the argument is an entry; `key` names it otherwise."""
+        return DataError(path, self.name if key is None else key, self.expected, self.got, advice=self.advice)
 
 
 class DataError(Exception):
-    """A file or folder has other contents than expected.
+    """A file or folder has other contents than expected: "config.json: fit: expected an object, got none".
 
     Args:
         path: the file or folder at fault.
-        field: the part of it that is wrong (a key, a property, a line), or "" for the file as a whole.
-        reason: what was expected, and what the file holds.
+        key: the part of it that is wrong (an entry, a property, a line), or "" for the file as a whole.
+        expected: what that has to be.
+        got: what it is, or "" where that says nothing; as of :class:`ArgumentError`.
+        advice: why that is so, or what to do about it.
     """
 
-    def __init__(self, path: str | PathLike[str], field: str, reason: str) -> None:
-        super().__init__(path, field, reason)
+    def __init__(
+        self, path: str | PathLike[str], key: str, expected: str, got: object = "", *, advice: str = ""
+    ) -> None:
         self.path = path
-        self.field = field
-        self.reason = reason
+        self.key = key
+        self.expected = expected
+        self.got = _shown(got)
+        self.advice = advice
+        super().__init__(path, key, expected, self.got)
 
     def __str__(self) -> str:
-        where = f"{self.path}: {self.field}" if self.field else f"{self.path}"
-        return f"{printable(where)}: {self.reason}"
+        where = f"{self.path}: {self.key}" if self.key else f"{self.path}"
+        return sentence(where, self.expected, self.got, self.advice)
 
 
 class PhotosRefused(DataError):
-    """The cameras of photos cannot be found, or cannot be trusted; the reason says what to photograph next."""
+    """The cameras of photos cannot be found, or cannot be trusted; the advice says what to photograph next."""
 
 
 class TrainingDiverged(RuntimeError):

@@ -16,14 +16,14 @@ def read_json(path: Path, finite: bool = True) -> dict[str, Any]:
     """Read a JSON object; a DataError if the file is missing, over 64 MiB, no object, or refused by `parse_json`."""
     try:
         if path.stat().st_size > _MAX_BYTES:
-            raise DataError(path, "", f"is larger than {_MAX_BYTES // 2**20} MiB")
+            raise DataError(path, "", f"at most {_MAX_BYTES // 2**20} MiB", "more")
         value = parse_json(path.read_bytes(), finite)
     except OSError as error:
-        raise DataError(path, "", f"cannot be read ({error.strerror})") from error
+        raise DataError(path, "", "a file that can be read", advice=f"{error.strerror}") from error
     except ValueError as error:
-        raise DataError(path, "", f"is not readable JSON ({error})") from error
+        raise DataError(path, "", "readable JSON", advice=str(error)) from error
     if not isinstance(value, dict):
-        raise DataError(path, "", f"expected a JSON object, got a {type(value).__name__}")
+        raise DataError(path, "", "a JSON object", f"a {type(value).__name__}")
     return value
 
 

@@ -24,7 +24,7 @@ def check_device(name: str) -> torch.device:
         torch.zeros(1, device=device).item()  # the meta device has no numbers
     except Exception as error:  # RuntimeError, AssertionError or ImportError, by the backend
         reason = str(error).partition(". ")[0].splitlines()[0]
-        raise ArgumentError(f"device: expected cpu or a GPU of this machine, got {name!r} ({reason:.120})") from error
+        raise ArgumentError("device", "cpu or a GPU of this machine", f"{name!r} ({reason:.120})") from error
     return device
 
 

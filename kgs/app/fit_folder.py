@@ -1,10 +1,6 @@
 """What `kgs fit` does, in its order: scene, initial points, training, files, page; then all is published."""
 
-import signal
-import threading
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,22 +25,21 @@ from kgs.app.files.results_folder import (
 from kgs.app.page.fit_page import write_own_page
 from kgs.datasets.scene import Scene
 from kgs.fit.checkpoint import save_checkpoint
-from kgs.fit.config import FitConfig, min_side
+from kgs.fit.config import FitConfig
 from kgs.fit.fit import Fit
 from kgs.fit.measures import measure
-from kgs.fit.plan import Plan, expected_memory, gaussian_limit, make_plan
-from kgs.fit.pruning import prune
-from kgs.fit.run import choose_points, decide
+from kgs.fit.plan import expected_memory
+from kgs.fit.run import check_before_points
 from kgs.fit.trainer import Trainer
 from kgs.metrics.lpips import Lpips
 from kgs.ply import save_ply
 
-from .console import each, progress, say
+from .console import each, say
 from .files.exports import write_exports
 from .scene_request import SceneRequest
 from .stages import Stages
+from .training import Training
 
-_SAVE_SECONDS = 60.0
 _TEST = "test"  # folder of the renders of test views
 
 
@@ -98,42 +93,48 @@ def fit_folder(
     out = Path(out)
     stages = Stages(say) if stages is None else stages
     check_packages("jinja2")  # even what is used only after training
-    plan = make_plan(scene, config)
-    _check_size(scene, config, lpips)
+    check_before_points(scene, config, lpips is not None)
     names = png_names([*scene.train.names, *scene.test.names])
     _check_out(out, scene)
     with locked(out):
         check_fit_files(out, resume, [f"{_TEST}/{names[view]}" for view in scene.test.names])
         work = out / UNFINISHED
-        trainer = _trainer(scene, config, plan, out, resume, say, stages)
-        work.mkdir(exist_ok=True)
-        notes = _Notes(trainer, say)
-        is_trained = False
-        try:
+        former = _former(out, resume, say)
+        notes = _Notes(say)
+
+        def begin(trainer: Trainer) -> None:
+            say(f"resumed at step {trainer.step}" if former else _expectation(trainer))
+            work.mkdir(exist_ok=True)
+            notes.say_new(trainer)
             if not (work / CHECKPOINT).exists():
                 save_checkpoint(work / CHECKPOINT, trainer.state_dict())  # initial points can take a minute
-            settings = _settings(trainer, request)
             with replacing(work, "fit") as new:
-                write_json(new / "config.json", settings)
+                write_json(new / "config.json", _settings(trainer, request))
             stages.begin("fit")
-            fit, stopped_by = train(trainer, work / CHECKPOINT)
-            is_trained = True
+
+        if former is None:
+            stages.begin("initial points")
+        training = Training(work / CHECKPOINT, begun=begin)
+        try:
+            trainer, fit = training.fit(scene, config, former)
+        except BaseException:
+            if training.trainer is not None and not training.trainer.saved:
+                discard_fit(work)
+            raise
+        try:
             with replacing(work, "fit", keep_on_error=True) as new:
                 stages.begin("film")
                 fit = _write_results(fit, new, names, request, lpips, held_out)
                 for note in fit.notes:
                     trainer.state.note(note)
                 stages.begin("page")
-                write_own_page(new, out, fit, request, settings)
+                write_own_page(new, out, fit, request, _settings(trainer, request))
                 if not trainer.is_saved:  # results and checkpoint belong together
                     trainer.save(work / CHECKPOINT, fit.part)
             enter(work, "fit", (CHECKPOINT, PREVIOUS))
         except BaseException:
-            if is_trained:
-                notes.say_new()
-                say(f"{printable(new)}: holds the results that could be written")
-            elif not trainer.saved:
-                discard_fit(work)
+            notes.say_new(trainer)
+            say(f"{printable(new)}: holds the results that could be written")
             raise
         folder = out
         is_done = trainer.step >= trainer.plan.schedule.steps
@@ -145,8 +146,8 @@ def fit_folder(
             if Path(scene.root).resolve() != work.resolve():
                 discard(work, "photos")  # of another fit: those of this one are published with it
             publish(work, out)
-        notes.say_new()
-    return Published(fit, stopped_by, folder)
+        notes.say_new(trainer)
+    return Published(fit, training.signal, folder)
 
 
 def _state(folder: Path) -> str:
@@ -154,60 +155,46 @@ def _state(folder: Path) -> str:
     return "finished fit" if is_finished(folder) else f"fit, which got to step {step_of(folder)}"
 
 
-def _check_size(scene: Scene, config: FitConfig, lpips: Lpips | None) -> None:
-    """A DataError where images are too small for the measures."""
-    smallest = min_side(config, lpips is not None)
-    for views in (scene.train, scene.test):
-        height, width = views.images.shape[-2:]
-        if min(height, width) < smallest:
-            reason = f"expected at least {smallest}x{smallest} pixels, got {width}x{height}"
-            raise DataError(scene.root, "images", reason)
-
-
 def _check_out(out: Path, scene: Scene) -> None:
     """Make the folder; a DataError where it cannot be written to, or holds the files of a scene."""
     try:
         check_folder(out, scene.root)
     except OSError as error:
-        raise DataError(out, "", f"expected a folder that results can be written to ({error.strerror})") from error
+        raise DataError(out, "", "a folder that results can be written to", advice=f"{error.strerror}") from error
 
 
-def _trainer(
-    scene: Scene, config: FitConfig, plan: Plan, out: Path, resume: bool, say: Callable[[str], None], stages: Stages
-) -> Trainer:
-    """A trainer that begins, or one that continues."""
-    former = next((folder for folder in (out / UNFINISHED, out) if has_fit(folder)), None)
-    if resume and former is not None:
-        trainer = Trainer.resume(scene, config, former / CHECKPOINT)
-        say(f"resumed at step {trainer.step}")
-        return trainer
+def _former(out: Path, resume: bool, say: Callable[[str], None]) -> Path | None:
+    """The checkpoint that the fit goes on from; None for one that begins, and says so where there is another."""
+    folder = next((folder for folder in (out / UNFINISHED, out) if has_fit(folder)), None)
+    if resume and folder is not None:
+        return folder / CHECKPOINT
     if resume:
         say(f"{printable(out)}: there is nothing to resume: the fit starts at the beginning")
-    elif former is not None:
+    elif folder is not None:
         until = "this one is done" if is_finished(out) else "this one is done or gets further"
         say(f"{printable(out)}: keeps its {_state(out)}, until {until}; to go on with it, use --resume")
-    stages.begin("initial points")
-    points = choose_points(scene, config, each)
-    plan = decide(plan, points)
-    memory = expected_memory(scene, gaussian_limit(plan.config, len(points.points)))
-    say(f"initial points: {len(points.points)} ({points.kind}); the fit takes up to {memory / 2**30:.1f} GiB of memory")
-    return Trainer(scene, plan, points)
+    return None
+
+
+def _expectation(trainer: Trainer) -> str:
+    """What a fit begins with and how much memory it takes, in words."""
+    init = trainer.state.start.init
+    memory = expected_memory(trainer.scene, trainer.plan.max_gaussians)
+    return f"initial points: {init['points']} ({init['kind']}); the fit takes up to {memory / 2**30:.1f} GiB of memory"
 
 
 class _Notes:
     """Says the notes of a trainer, each once."""
 
-    def __init__(self, trainer: Trainer, say: Callable[[str], None]) -> None:
-        self._trainer = trainer
+    def __init__(self, say: Callable[[str], None]) -> None:
         self._say = say
         self._count = 0
-        self.say_new()
 
-    def say_new(self) -> None:
+    def say_new(self, trainer: Trainer) -> None:
         """Say the notes that are new."""
-        for note in self._trainer.state.notes[self._count :]:
+        for note in trainer.state.notes[self._count :]:
             self._say(note)
-        self._count = len(self._trainer.state.notes)
+        self._count = len(trainer.state.notes)
 
 
 def _settings(trainer: Trainer, request: SceneRequest) -> dict[str, Any]:
@@ -242,65 +229,3 @@ def _write_results(
     metrics = measure(fit, lpips) | ({"held_out": held_out} if held_out else {})
     write_json(folder / "metrics.json", metrics)
     return fit.annotated(metrics=metrics, notes=(*fit.notes, *notes))
-
-
-def train(trainer: Trainer, checkpoint: Path | None, title: str = "fit") -> tuple[Fit, int]:
-    """Train to the end with a progress line, and :func:`prune`; save checkpoints each minute and at evaluations.
-
-    SIGINT (Ctrl-C), SIGTERM and SIGHUP end the training after the current step. Returns the fit and the number of that
-    signal, or 0. If a checkpoint cannot be written (a full disk), a note says so the first time, and training goes on.
-    """
-    saved = time.monotonic()
-    has_failed = False
-    schedule = trainer.plan.schedule
-
-    def save(part: dict[str, Any] | None = None) -> None:
-        nonlocal saved, has_failed
-        saved = time.monotonic()
-        if checkpoint is not None:
-            try:
-                trainer.save(checkpoint, part)
-            except OSError as error:
-                if not has_failed:  # the next one is tried a minute later: no line for each
-                    trainer.state.note(f"step {trainer.step}: no checkpoint: {error}")
-                has_failed = True
-
-    with _interruptible() as stopped, progress(schedule.steps, title, trainer.step) as advance:
-
-        def after_step(trainer: Trainer, loss: float) -> bool:
-            advance(f"loss={loss:.4f}, {len(trainer.model)} Gaussians")
-            if trainer.step in schedule.evaluate or time.monotonic() - saved > _SAVE_SECONDS:
-                save()
-            return bool(stopped)
-
-        fit = prune(trainer.fit(after_step))
-        save(fit.part)
-    return fit, stopped[0] if stopped else 0
-
-
-@contextmanager
-def _interruptible() -> Iterator[list[int]]:
-    """Record SIGINT, SIGTERM and SIGHUP in the list that is yielded; a second one acts as usual.
-
-    Ignored signals (nohup) stay ignored, and only the main thread can handle any.
-    """
-    received: list[int] = []
-    usual: dict[int, Any] = {}  # the handlers that are replaced
-    if threading.current_thread() is threading.main_thread():
-        for name in ("SIGINT", "SIGTERM", "SIGHUP"):
-            number = getattr(signal, name, None)  # Windows has no SIGHUP
-            handler = None if number is None else signal.getsignal(number)
-            if number is not None and handler not in (None, signal.SIG_IGN):
-                usual[number] = handler
-
-    def record(number: int, _: object) -> None:
-        received.append(number)
-        signal.signal(number, usual[number])
-
-    for number in usual:
-        signal.signal(number, record)
-    try:
-        yield received
-    finally:
-        for number, handler in usual.items():
-            signal.signal(number, handler)

@@ -8,14 +8,10 @@ from typing import Any
 from kgs.datasets.source import SceneSource
 from kgs.fit.config import FitConfig
 from kgs.fit.measures import measure
-from kgs.fit.plan import make_plan
-from kgs.fit.run import choose_points, decide
-from kgs.fit.trainer import Trainer
 from kgs.metrics.lpips import Lpips
 
-from .console import each
-from .fit_folder import train
 from .scene_request import SceneRequest
+from .training import Training
 
 MIN_PHOTOS = 4  # three to fit, and one to measure
 
@@ -43,11 +39,10 @@ def measure_held_out(
         training, or 0.
     """
     scene = replace(request, hold_out=photos).load(Path(source.root), None, source)
-    plan = make_plan(scene, replace(config, evaluations=1))
-    points = choose_points(scene, config, each)
-    fit, signal = train(Trainer(scene, decide(plan, points), points), None, title="measurement")
+    training = Training(title="measurement")
+    _, fit = training.fit(scene, replace(config, evaluations=1))
     if say is not None:
         for note in fit.notes:
             say(note)
-    metrics = {} if signal else measure(fit, lpips)
-    return metrics.get("color_corrected") or metrics.get("test") or {}, signal
+    metrics = {} if training.signal else measure(fit, lpips)
+    return metrics.get("color_corrected") or metrics.get("test") or {}, training.signal

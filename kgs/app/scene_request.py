@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Self
 
-from kgs._support.errors import DataError
+from kgs._support.errors import DataError, quoted
 from kgs._support.json_files import is_number
 from kgs.datasets.load import load_scene
 from kgs.datasets.options import MASK_MODES
@@ -32,7 +32,7 @@ class SceneRequest:
         roll: degrees by which page and film are turned clockwise.
         title: of the page; "": the name of the folder.
         photo_folder: name of the folder of photos, as "images_8"; "": that of the largest.
-        masks: the folder of their masks; "": where the scene's files say, or beside the photos.
+        masks: the folder of their masks; "": where the scene's files say, or `masks/`.
         mask_mode: what black in a mask means, "ignore" or "transparent".
     """
 
@@ -103,8 +103,8 @@ class SceneRequest:
         for name, (expected, is_right) in _EXPECTED.items():
             value = getattr(request, name)
             if not is_right(value):
-                got = f"{value!r}"[:60] if name in values else "none"
-                raise DataError(path, f"request.{name}", f"expected {expected}, got {got}")
+                got = quoted(value) if name in values else "none"
+                raise DataError(path, f"request.{name}", expected, got)
         return replace(request, roll=float(request.roll))
 
 

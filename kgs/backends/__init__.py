@@ -13,7 +13,7 @@ from collections.abc import Callable
 from torch import Tensor
 from torch import device as Device  # `import torch` would be taken for the folder of that name here
 
-from kgs._support.errors import ArgumentError
+from kgs._support.errors import ArgumentError, quoted
 
 from .base import Backend, OptimizerStages
 from .cpu import CpuBackend
@@ -44,7 +44,7 @@ def available() -> tuple[str, ...]:
 def check_backend(name: str) -> None:
     """Raise a ValueError for a backend that does not exist, a ModuleNotFoundError for one that is not installed."""
     if name not in available():
-        raise ArgumentError(f"backend: expected one of {available()}, got {name!r}")
+        raise ArgumentError("backend", f"one of {available()}", quoted(name))
     for backend in BACKENDS:
         if backend.name == name and backend.package and not backend.is_installed():
             package, how = backend.package
@@ -65,7 +65,7 @@ def resolve(name: str, device: Device) -> str:
     devices = next(" and ".join(backend.devices or ()) for backend in BACKENDS if backend.name == name)
     others = "".join(f'; "{x.name}" runs on {device}, too' for x in BACKENDS if x.devices and x.runs_on(device))
     reason = f"which runs on {devices} alone{others}"
-    raise ArgumentError(f'backend: expected "auto" or "torch" on {device}, got "{name}", {reason}')
+    raise ArgumentError("backend", f'"auto" or "torch" on {device}', f'"{name}", {reason}')
 
 
 def former_or_auto(name: str, device: Device) -> str:
@@ -91,7 +91,7 @@ def choose(name: str, stage: str, device: Device, covers: Callable[[Backend], bo
         if name in ("auto", backend.name) and covers(backend) and _may_take(backend, name, device):
             return backend
     check_backend(name)
-    raise ArgumentError(f'backend: {name!r} does not cover this call of {stage}, expected "auto" or "torch"')
+    raise ArgumentError("backend", f'"auto" or "torch" for this call of {stage}', f"{name!r}, which does not cover it")
 
 
 def optimizer_stages(name: str, like: Tensor) -> OptimizerStages | None:

@@ -43,6 +43,5 @@ def row_slices(row_bytes: list[int], max_bytes: int) -> list[tuple[int, int]]:
 def check_fits(row_bytes: int, max_bytes: int) -> None:
     """Raise a ValueError where one row of tiles needs more than `max_bytes`."""
     if row_bytes > max_bytes:
-        got = f"expected at least that, got {max_bytes} for it"
-        ways = "raise max_bytes, or render fewer or smaller Gaussians"
-        raise ArgumentError(f"max_bytes: one row of tiles needs {row_bytes} bytes, {got}; {ways}")
+        advice = "raise max_bytes, or render fewer or smaller Gaussians"
+        raise ArgumentError("max_bytes", f"at least {row_bytes}, for a row of tiles", max_bytes, advice=advice)

@@ -94,4 +94,4 @@ def check_scenes(data: Path, scenes: Iterable[str]) -> None:
     """DataError where the folder of KGS_DATA lacks one of these scenes."""
     for scene in scenes:
         if not (data / scene).is_dir():
-            raise DataError(data, scene, "expected this scene in the folder of KGS_DATA")
+            raise DataError(data, scene, "this scene in the folder of KGS_DATA")

@@ -3,12 +3,12 @@
 `initial_points` needs the extra `scenes`; the others need `app`.
 
 Examples:
-    >>> from kgs.fit import FitConfig, Trainer, choose_points, decide, make_plan, prune
+    >>> from kgs.fit import FitConfig, Trainer, choose_points, make_plan, prune
     >>> from kgs.datasets import synthetic_scene
     >>> scene = synthetic_scene(train_views=2, size=(16, 16))
     >>> config = FitConfig(steps=2, init="random", init_points=50)
     >>> points = choose_points(scene, config)
-    >>> plan = decide(make_plan(scene, config), points)
+    >>> plan = make_plan(scene, config, points)
     >>> trainer = Trainer(scene, plan, points)
     >>> while trainer.step < plan.schedule.steps:
     ...     loss = trainer.train_step()
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from .measures import measure
     from .plan import Plan, make_plan
     from .pruning import prune
-    from .run import choose_points, decide, fit_scene
+    from .run import Hooks, choose_points, fit_scene
     from .trainer import Trainer
 
 __all__ = [
@@ -40,9 +40,9 @@ __all__ = [
     "initial_points",
     "choose_points",
     "make_plan",
-    "decide",
     "prune",
     "fit_scene",
+    "Hooks",
     "measure",
 ]
 
@@ -54,7 +54,7 @@ __getattr__, __dir__ = lazy_names(
         "kgs.fit.plan": ("Plan", "make_plan"),
         "kgs.fit.trainer": ("Trainer",),
         "kgs.fit.fit": ("Fit",),
-        "kgs.fit.run": ("choose_points", "decide", "fit_scene"),
+        "kgs.fit.run": ("Hooks", "choose_points", "fit_scene"),
         "kgs.fit.pruning": ("prune",),
         "kgs.fit.measures": ("measure",),
     },

@@ -118,10 +118,8 @@ class Adam:
             negative = any(bool((loaded[name] < 0).any()) for name in ("step", "exp_avg_sq"))
             if negative or {name: tuple(value.shape) for name, value in loaded.items()} != shapes:
                 given = {name: tuple(value.shape) for name, value in loaded.items()}
-                raise ArgumentError(
-                    f"optimizer: expected a step and two moments of shape {tuple(parameter.shape)} for "
-                    f"{group['name']}, the second not negative, got shapes {given}"
-                )
+                expected = f"a step and two moments of shape {tuple(parameter.shape)} for {group['name']}"
+                raise ArgumentError("optimizer", f"{expected}, the second not negative", f"shapes {given}")
             moments = {name: torch.empty_like(parameter).copy_(loaded[name]) for name in ("exp_avg", "exp_avg_sq")}
             self.state[parameter] = {"step": float(loaded["step"]), **moments}
 

@@ -7,10 +7,11 @@ under "state", next to the format and the SHA-256 of tensors and JSON. Loading m
 import hashlib
 import json
 import os
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from functools import reduce
 from operator import getitem
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from kgs._support.errors import DataError
+from kgs._support.errors import ArgumentError, DataError, quoted
 from kgs._support.json_files import parse_json
 
 from .state import digest
@@ -90,27 +91,36 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise DataError(path, "", f"expected a checkpoint, got {error.strerror}") from error
+        raise DataError(path, "", "a checkpoint", advice=f"{error.strerror}") from error
     try:
         tensors = safetensors.torch.load(content)
         metadata = parse_json(content[8 : 8 + int.from_bytes(content[:8], "little")])["__metadata__"]
         if metadata["format"] != _FORMAT:
-            raise ValueError(f"expected the format {_FORMAT!r}, got {metadata['format']!r}")
+            raise DataError(path, "format", quoted(_FORMAT), quoted(metadata["format"]))
         if metadata["sha256"] != _digest_all(metadata["state"], tensors):
-            raise ValueError("the checksum is not that of the content: the file is damaged")
+            raise DataError(path, "sha256", "that of the content", "another", advice="the file is damaged")
         state = parse_json(metadata["state"].encode())
         for name, tensor in tensors.items():
             if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
-                raise ValueError(f"{name}: expected finite numbers, got NaN or infinity")
+                raise DataError(path, name, "finite numbers", "NaN or infinity")
             *folders, key = name.split("/")
             reduce(getitem, folders, state)[key] = tensor.clone()
     except KeyError as error:
-        raise DataError(path, str(error.args[0]), "expected this entry in a checkpoint of kgs, got none") from error
+        raise DataError(path, str(error.args[0]), "this entry in a checkpoint of kgs", "none") from error
     except (safetensors.SafetensorError, TypeError, ValueError) as error:
-        raise DataError(path, "", f"is not a whole checkpoint of kgs ({error})") from error
+        raise DataError(path, "", "a whole checkpoint of kgs", advice=str(error)) from error
     if not isinstance(state, dict):
-        raise DataError(path, "state", f"expected a dict, got a {type(state).__name__}")
+        raise DataError(path, "state", "a dict", f"a {type(state).__name__}")
     return state
+
+
+@contextmanager
+def errors_of(path: str | PathLike[str]) -> Iterator[None]:
+    """Turn an ArgumentError, which names an entry, into an error about this file."""
+    try:
+        yield
+    except ArgumentError as error:
+        raise error.about(path) from error
 
 
 def _digest_all(text: str, tensors: Mapping[str, Tensor]) -> str:

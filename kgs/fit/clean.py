@@ -132,7 +132,7 @@ def find_strays(
     check_strength(strength)
     if len(depths) != (0 if cameras is None else cameras.batch_size):
         expected = 0 if cameras is None else cameras.batch_size
-        raise ArgumentError(f"depths: expected one for each of {expected} cameras, got {len(depths)}")
+        raise ArgumentError("depths", f"one for each of {expected} cameras", len(depths))
     root = math.sqrt(strength)
     means = model.means.detach().double().cpu()
     axes = model.log_scales.detach().double().cpu().exp().sort(dim=1, descending=True).values
@@ -170,7 +170,7 @@ def clean(fit: Fit, strength: float = 1.0, bar: ProgressBar = silent) -> Cleaned
     check_strength(strength)
     views = fit.scene.train
     if views.images.is_meta:
-        raise ArgumentError("fit: expected a scene with its photos, got one that was loaded without them")
+        raise ArgumentError("fit", "a scene with its photos", "one that was loaded without them")
     renders = ViewRenders(views, fit.render_with_depth)
     strays = find_strays(fit.model, strength, views.cameras, renders.median_depths)
     before = [*renders.psnr_per_view]
@@ -202,13 +202,13 @@ def clean(fit: Fit, strength: float = 1.0, bar: ProgressBar = silent) -> Cleaned
 def check_strength(strength: float) -> None:
     """Raise a ValueError unless this is a strength."""
     if not 0.0 < strength <= MAX_STRENGTH:
-        raise ArgumentError(f"strength: expected a number above 0, at most {MAX_STRENGTH:g}, got {strength}")
+        raise ArgumentError("strength", f"a number above 0, at most {MAX_STRENGTH:g}", strength)
 
 
 def check_left(count: int) -> None:
     """Raise a ValueError if no Gaussian is left."""
     if not count:
-        raise ArgumentError("strength: expected one at which a Gaussian is left, got one at which all are strays")
+        raise ArgumentError("strength", "one at which a Gaussian is left", "one at which all are strays")
 
 
 def _median(values: Tensor) -> Tensor:

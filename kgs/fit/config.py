@@ -11,7 +11,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self, get_args, get_origin, get_type_hints
 
-from kgs._support.errors import ArgumentError
+from kgs._support.errors import ArgumentError, quoted
 
 
 class _Range(NamedTuple):
@@ -36,6 +36,9 @@ _Count = Annotated[int, _Range(0, 10_000_000)]
 _Positive = Annotated[float, _Range(0, ends="(]")]
 _Weight = Annotated[float, _Range(0)]
 _Share = Annotated[float, _Range(0, 1)]
+_Rate = Annotated[float, _Range(0, 1, "[)")]
+_Degree = Annotated[int, _Range(0, 3)]
+_Decay = Annotated[float, _Range(0, 1, "(]")]
 Backend = Literal["auto", "torch", "numba", "triton"]
 Background = Literal["black", "white"]
 
@@ -109,7 +112,7 @@ class Recipe:
         _check(self)
         if self.reset_interval and self.reset_opacity <= self.prune_opacity:
             expected = f"above prune_opacity ({self.prune_opacity:g}), or a reset would remove all Gaussians"
-            raise ArgumentError(f"reset_opacity: expected a number {expected}, got {self.reset_opacity:g}")
+            raise ArgumentError("reset_opacity", f"a number {expected}", f"{self.reset_opacity:g}")
 
 
 @dataclass(frozen=True)
@@ -117,10 +120,9 @@ class FitConfig:
     """The settings of one fit. NumPy's numbers are accepted and become Python's.
 
     `fit_scene` and the command use all entries. A `Trainer` is given its initial points and removes nothing after the
-    last step: it ignores init, init_file, init_points, draw and prune. Unless :func:`kgs.fit.run.decide` was asked,
-    it takes a `sh_degree` of None as 0, a `drop` of None as 0.3, a `steps` of None as 1100 with more than three views,
-    and all photos as equally exposed. :mod:`kgs.fit.overlap` has the numbers of steps and drop. Only the command takes
-    the device auto, its default: a GPU if kgs has kernels for it that pass their check, else the CPU.
+    last step: it ignores init, init_file, init_points, draw and prune. :func:`kgs.fit.plan.make_plan` settles the
+    entries of None, and :mod:`kgs.fit.overlap` has its numbers of steps and drop. Only the command takes the device
+    auto, its default: a GPU if kgs has kernels for it that pass their check, else the CPU.
 
     Args:
         steps: number of training steps, to which the recipe's counts are scaled. Unless given: 900 for up to three
@@ -192,7 +194,7 @@ class FitConfig:
         _check(self)
         if (self.init == "file") != (self.init_file is not None):
             wanted = "a point cloud for" if self.init == "file" else "none without"
-            raise ArgumentError(f'init_file: expected {wanted} the init "file", got {self.init_file}')
+            raise ArgumentError("init_file", f'{wanted} the init "file"', self.init_file)
 
     def to_dict(self) -> dict[str, Any]:
         """The entries as plain values, for JSON and checkpoints."""
@@ -203,11 +205,43 @@ class FitConfig:
         """The inverse of `to_dict`; ValueError where an entry is unknown or out of range."""
         recipe = values.get("recipe", {}) if isinstance(values, dict) else None
         if not isinstance(recipe, dict):
-            raise ArgumentError(f"values: expected the entries of a FitConfig, got {str(values)[:60]!r}")
-        for kind, entries in ((cls, values), (Recipe, recipe)):
-            if unknown := sorted({*map(str, entries)} - {entry.name for entry in fields(kind)}):
-                raise ArgumentError(f"values: expected the entries of a {kind.__name__}, got {unknown[0]!r}")
-        return cls(**{**values, "recipe": Recipe(**recipe)})
+            raise ArgumentError("values", f"the entries of a {cls.__name__}", quoted(values))
+        kind = get_type_hints(cls)["recipe"]
+        for owner, entries in ((cls, values), (kind, recipe)):
+            if unknown := sorted({*map(str, entries)} - {entry.name for entry in fields(owner)}):
+                raise ArgumentError("values", f"the entries of a {owner.__name__}", quoted(unknown[0]))
+        return cls(**{**values, "recipe": kind(**recipe)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class SettledRecipe(Recipe):
+    """A recipe that leaves nothing open."""
+
+    opacity_decay: _Decay
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings(FitConfig):
+    """The configuration of a fit once it is settled: what a training step reads is no longer None."""
+
+    steps: _Steps
+    drop: _Rate
+    sh_degree: _Degree
+    coarse: _Share
+    recipe: SettledRecipe
+
+    @classmethod
+    def of(cls, config: FitConfig, *, opacity_decay: float, **entries: Any) -> Self:
+        """The settings of a configuration, with these entries in place of its own."""
+        recipe = SettledRecipe(**vars(config.recipe) | {"opacity_decay": opacity_decay})
+        return cls(**vars(config) | entries | {"recipe": recipe})
+
+    def of_resumed(self, config: FitConfig) -> Self:
+        """The settings of a fit that goes on: those of a configuration, and these where it leaves something open."""
+        names = ("steps", "drop", "sh_degree", "coarse")
+        entries = {name: getattr(self, name) for name in names if getattr(config, name) is None}
+        decay = config.recipe.opacity_decay
+        return self.of(config, opacity_decay=self.recipe.opacity_decay if decay is None else decay, **entries)
 
 
 def min_side(config: FitConfig, lpips: bool) -> int:
@@ -220,9 +254,13 @@ def _check(config: FitConfig | Recipe) -> None:
     hints = get_type_hints(type(config), include_extras=True)
     for entry in fields(config):
         value = getattr(config, entry.name)
-        converted, expected = _convert(value, hints[entry.name])
-        if converted is None and value is not entry.default:
-            raise ArgumentError(f"{entry.name}: expected {expected}, got {str(value)[:60]!r}")
+        hint = hints[entry.name]
+        kinds = get_args(get_args(hint)[0] if get_origin(hint) is Annotated else hint)
+        if value is None and type(None) in kinds:
+            continue
+        converted, expected = _convert(value, hint)
+        if converted is None:
+            raise ArgumentError(entry.name, expected, quoted(value))
         object.__setattr__(config, entry.name, converted)
 
 

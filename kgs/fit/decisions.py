@@ -101,7 +101,7 @@ class Decisions:
         try:
             return cls(**{name: _KINDS[name](**part) for name, part in values.items()})
         except (AttributeError, KeyError, TypeError) as error:
-            raise ArgumentError(f"decisions: expected those of a fit, got {error}") from error
+            raise ArgumentError("decisions", "those of a fit", str(error)) from error
 
 
 _KINDS: dict[str, Any] = {

@@ -14,7 +14,7 @@ _BOUND = 1e4  # extents: no photo tells a larger scale from this one
 
 def parameter_fault(model: GaussianModel) -> str:
     """Describe the first parameter that is not finite, or overflows when it is activated; "" if there is none."""
-    for name, parameter in model.named_parameters():
+    for name, parameter in model.per_gaussian().items():
         row = _first_row(~torch.isfinite(parameter.detach().exp() if name == "log_scales" else parameter.detach()))
         if row is not None:
             return f"expected finite parameters, got {parameter[row].tolist()} in {name} of Gaussian {row}"
@@ -29,7 +29,7 @@ def step_fault(model: GaussianModel, num_nonfinite: Tensor, loss: float) -> str:
 
 def gradient_fault(model: GaussianModel) -> str:
     """Describe the first gradient whose square, which Adam keeps, overflows (above 1e19); "" if there is none."""
-    for name, parameter in model.named_parameters():
+    for name, parameter in model.per_gaussian().items():
         if parameter.grad is None:
             continue
         flat = parameter.grad.flatten()

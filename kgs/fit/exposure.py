@@ -20,11 +20,9 @@ from torch import Tensor
 
 from kgs._support.errors import warn
 from kgs.datasets.scene import Scene
-from kgs.init_points import InitialPoints
 from kgs.init_points.patches import MIN_PATCHES, PatchColors
 
 from .decisions import Decisions, ExposureDecision
-from .plan import Plan
 
 MIN_RATIO = 1.3  # between the gains of two photos in a channel, for gains to be used
 MAX_LEFT = 0.6  # of the median difference of a patch's colours, after the gains, for gains to be used
@@ -33,30 +31,25 @@ ROUNDS = 8  # of the weights
 PRIOR = 1e-3  # so many imaginary patches have gain 1: they decide where no real one does
 
 
-def decide_exposure(plan: Plan, points: InitialPoints) -> Plan:
-    """Decide whether the training photos differ in exposure or white balance, and by how much.
+def decide_exposure(patches: PatchColors | None, how: str) -> ExposureDecision | None:
+    """The gains of the training photos, if they differ in exposure or white balance.
 
     Args:
-        plan: of the fit.
-        points: its initial points; without patches there are no gains, and a warning if they were asked for.
-
-    Returns:
-        The plan. If gains are used, `decisions.exposure` has them.
+        patches: of the initial points; without any there are no gains, and a warning if they were asked for.
+        how: the entry `exposure` of the configuration.
     """
-    how = plan.config.exposure
     if how == "same":
-        return plan
-    if points.patches is None or len(points.patches) < MIN_PATCHES:
+        return None
+    if patches is None or len(patches) < MIN_PATCHES:
         if how == "each":
             warn("exposure: the initial points come without patches of colour, so photos are taken as equally exposed")
-        return plan
-    gains, left = estimate_gains(points.patches)
+        return None
+    gains, left = estimate_gains(patches)
     ratio = float((gains.amax(0) / gains.amin(0)).max())
     if how == "auto" and (ratio < MIN_RATIO or left > MAX_LEFT):
-        return plan
+        return None
     rows = [[round(value, 4) for value in row] for row in gains.tolist()]
-    exposure = ExposureDecision(gains=rows, left=round(left, 3), n=len(points.patches))
-    return replace(plan, decisions=replace(plan.decisions, exposure=exposure))
+    return ExposureDecision(gains=rows, left=round(left, 3), n=len(patches))
 
 
 def estimate_gains(patches: PatchColors) -> tuple[Tensor, float]:

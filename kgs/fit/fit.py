@@ -16,7 +16,7 @@ from kgs.metrics.evaluate import mean_psnr
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer, blend
 
-from .config import FitConfig
+from .config import Settings
 from .decisions import Decisions
 from .targets import background_of
 from .view_renders import ViewRenders
@@ -43,7 +43,7 @@ class Fit:
     model: GaussianModel
     options: RasterOptions
     backend: str = "auto"
-    settings: FitConfig | None = None
+    settings: Settings | None = None
     history: dict[str, Any] = field(default_factory=dict)
     decisions: Decisions = field(default_factory=Decisions)
     metrics: dict[str, Any] = field(default_factory=dict)

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from kgs._support.errors import ArgumentError, DataError
+from kgs._support.errors import ArgumentError, DataError, quoted
 from kgs._support.machine import peak_rss_mb, versions
 from kgs.metrics.coverage import psnr_by_coverage
 from kgs.metrics.evaluate import MEASURES, evaluate_images, views_to_correct
@@ -47,16 +47,12 @@ def measure(fit: Fit, lpips: Lpips | None = None) -> dict[str, Any]:
         differ in exposure, "color_corrected" has the measures of test views after an affine fit of their colours.
 
     Raises:
-        ValueError: the fit has no settings, or no history, as one that was read from its folder.
+        ValueError: the fit has no settings.
     """
     scene = fit.scene
     config = fit.settings
     if config is None:
-        raise ArgumentError("fit: expected a fit of kgs, which has settings, got a splat alone")
-    if not fit.history:
-        raise ArgumentError(
-            "fit: expected one that was just made, got one that was read from its folder: it has metrics"
-        )
+        raise ArgumentError("fit", "a fit of kgs, which has settings", "a splat alone")
     init = used_init(config.init, fit.history["init"]["kind"])
     init_note = _INIT_NOTES.get(init, "initial points that were given")
     if config.init in ("dense", "sift") and init in ("sift", "random") and init != config.init:
@@ -118,9 +114,9 @@ def measure_again(fit: Fit, path: Path, lpips: Lpips | None = None) -> dict[str,
         try:
             old_rows = {row["name"]: row for row in old["views"]}
         except (KeyError, TypeError) as error:
-            raise DataError(path, part, f"expected the metrics of a fit, got {str(old)[:60]}") from error
+            raise DataError(path, part, "the metrics of a fit", quoted(old)) from error
         if set(old_rows) != set(views.names):
-            raise DataError(path, part, f"has other views than the {len(views)} of {scene.root}: fit again")
+            raise DataError(path, part, f"the {len(views)} views of {scene.root}", "others", advice="fit again")
         fresh[part] = None
         if old_rows:
             is_corrected = part == "color_corrected"

@@ -6,16 +6,24 @@ But it blurs, and where most photos show the same surface it gains nothing. The 
 :class:`kgs.init_points.patches.PatchColors`.
 """
 
-from dataclasses import replace
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
-from kgs.init_points import InitialPoints
 from kgs.init_points.patches import MIN_PATCHES, PatchColors
 
 from .config import DROP
 from .decisions import OverlapDecision
-from .plan import FEW, Plan
 
+
+class Usual(NamedTuple):
+    """The length of a fit, and how fast opacities fade: with more views, what only some show is seen less often."""
+
+    steps: int
+    opacity_decay: float
+
+
+FEW = Usual(900, 0.9925)  # of a fit to up to three training views
+MANY = Usual(1100, 0.995)  # of a fit to more, where nothing tells how many of them show each patch
+FADING_STEPS = 1000  # up to so many the decay of few views is used: in longer fits too much would fade
 STEPS_OF_A_PHOTO = 275  # steps for each photo beyond the third that shows a patch of surface
 MAX_STEPS = 1400
 FEW_TOGETHER = 3.0  # photos that show two patches at once: up to so many the rate is `DROP`
@@ -40,36 +48,36 @@ class Overlap(NamedTuple):
         return cls(float(shares.sum()), float(shares.square().sum()))
 
 
-def decide_by_overlap(plan: Plan, points: InitialPoints) -> Plan:
-    """Decide the number of steps and the final rate of dropping, where the plan leaves them open.
+def decide_by_overlap(
+    patches: PatchColors | None, steps: int | None, drop: float | None
+) -> tuple[int, float, OverlapDecision | None]:
+    """The number of steps and the final rate of dropping, and what decided them.
 
     Args:
-        plan: of the fit.
-        points: its initial points.
-
-    Returns:
-        The plan with a rate, and with a number of steps. If the patches decided, `decisions.overlap` says by what.
-        Without patches the rate is `DROP`, and the fit has the usual length.
+        patches: of the initial points. With too few of them a fit has the usual length, and the rate is `DROP`.
+        steps: as given; None: open.
+        drop: as given; None: open.
     """
-    is_open = [name for name in ("steps", "drop") if getattr(plan.config, name) is None]
-    if not is_open:
-        return plan
-    patches = points.patches
+    if steps is not None and drop is not None:
+        return steps, drop, None
     if patches is None or len(patches) < MIN_PATCHES:
-        usual = {"steps": plan.schedule.steps, "drop": DROP}
-        return plan.decided({name: usual[name] for name in is_open})
+        return MANY.steps if steps is None else steps, DROP if drop is None else drop, None
     overlap = Overlap.of(patches)
-    chosen: dict[str, Any] = {
-        "steps": steps_for(overlap.views_per_patch),
-        "drop": drop_rate_for(overlap.views_per_pair),
-    }
-    entries = {name: chosen[name] for name in is_open}
+    chosen_steps = steps_for(overlap.views_per_patch) if steps is None else steps
+    chosen_drop = drop_rate_for(overlap.views_per_pair) if drop is None else drop
     decision = OverlapDecision(
         views_per_patch=round(overlap.views_per_patch, 2),
         views_per_pair=round(overlap.views_per_pair, 2),
         patches=len(patches),
+        steps=chosen_steps if steps is None else None,
+        drop=chosen_drop if drop is None else None,
     )
-    return plan.decided(entries, overlap=replace(decision, **entries))
+    return chosen_steps, chosen_drop, decision
+
+
+def usual_decay(is_few: bool, steps: int) -> float:
+    """The factor on opacities in a fit of so many steps, to a few training views or more."""
+    return (FEW if is_few and steps <= FADING_STEPS else MANY).opacity_decay
 
 
 def steps_for(views_per_patch: float) -> int:

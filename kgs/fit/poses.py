@@ -97,7 +97,7 @@ class MovingPoses:
         """Continue from a :meth:`state_dict`; a KeyError, TypeError or ValueError if an entry is missing or wrong."""
         extrinsics = state["extrinsics"]
         if extrinsics.shape != self.given.shape:
-            raise ArgumentError(f"poses: expected extrinsics {tuple(self.given.shape)}, got {tuple(extrinsics.shape)}")
+            raise ArgumentError("poses", f"extrinsics {tuple(self.given.shape)}", tuple(extrinsics.shape))
         self.extrinsics = extrinsics.double().clone()
         self._optimizer.load_state_dict(state["optimizer"])
 

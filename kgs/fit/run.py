@@ -1,53 +1,101 @@
 """A whole fit in one call: initial points, training, and leaving out what the scene does not need."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from os import PathLike
 from typing import Any
 
-from kgs._support.errors import DataError
+from kgs._support.checks import check_kind
+from kgs._support.errors import DataError, quoted
 from kgs._support.progress import ProgressBar, silent
 from kgs.datasets.scene import Scene
 from kgs.init_points import InitialPoints, initial_points
 from kgs.init_points.in_view import check_in_view
 
-from .config import FitConfig
-from .exposure import decide_exposure
+from .config import FitConfig, min_side
 from .fit import Fit
-from .overlap import decide_by_overlap
-from .plan import Plan, make_plan
+from .plan import Plan, check_machine, make_plan
 from .pruning import prune
 from .trainer import Trainer
-from .view_dependence import decide_degree
 
 
-def fit_scene(scene: Scene, config: FitConfig | None = None, *, bar: ProgressBar = silent) -> Fit:
-    """Fit a scene; nothing is written. `kgs fit` does the same and writes a folder.
+@dataclass(frozen=True)
+class Hooks:
+    """What a caller adds to a fit.
+
+    Args:
+        bar: wraps the loops of the initial points to show their progress, see :mod:`kgs._support.progress`.
+        make_trainer: makes the trainer of a fit that begins; for a subclass.
+        begun: called with the trainer before the first step.
+        after_step: called after each step with the trainer and the loss; True ends the training.
+        done: called with the trainer and the fit, after pruning.
+    """
+
+    bar: ProgressBar = silent
+    make_trainer: Callable[[Scene, Plan, InitialPoints], Trainer] = Trainer
+    begun: Callable[[Trainer], None] | None = None
+    after_step: Callable[[Trainer, float], bool] | None = None
+    done: Callable[[Trainer, Fit], None] | None = None
+
+
+def fit_scene(
+    scene: Scene,
+    config: FitConfig | None = None,
+    *,
+    points: InitialPoints | None = None,
+    resume: str | PathLike[str] | None = None,
+    hooks: Hooks = Hooks(),
+) -> Fit:
+    """Fit a scene: initial points, plan, training, pruning. Nothing is written; `kgs fit` calls it and writes a folder.
 
     Args:
         scene: posed training and test views; the test views are rendered only for the curve.
         config: the settings; None: the defaults.
-        bar: wraps the loops to show their progress, see :mod:`kgs._support.progress`.
+        points: the initial points; None: those that `config.init` asks for.
+        resume: a checkpoint to continue from, see :meth:`Trainer.resume`; None: the fit begins.
+        hooks: what is to happen beside it, as a progress bar or checkpoints.
 
     Raises:
-        DataError: the scene, or the file of initial points, has none.
+        DataError: the scene, the file of initial points or the checkpoint is not of use, or images are too small.
         TrainingDiverged: a number is not finite, or a scale explodes.
-        ValueError: images are too small, points too few, or the device or backend is not available.
+        ValueError: points are too few, or the device or backend is not available.
     """
     config = FitConfig() if config is None else config
-    plan = make_plan(scene, config)
-    points = choose_points(scene, config, bar)
-    return prune(Trainer(scene, decide(plan, points), points).fit())
+    if resume is not None:
+        trainer = Trainer.resume(scene, config, resume)
+    else:
+        check_before_points(scene, config)
+        points = choose_points(scene, config, hooks.bar) if points is None else points
+        trainer = hooks.make_trainer(scene, make_plan(scene, config, points), points)
+    if hooks.begun is not None:
+        hooks.begun(trainer)
+    fit = prune(trainer.fit(hooks.after_step))
+    if hooks.done is not None:
+        hooks.done(trainer, fit)
+    return fit
 
 
-def decide(plan: Plan, points: InitialPoints) -> Plan:
-    """The plan with what the photos settle: steps, drop rate, degree of the harmonics, and gains.
+def check_before_points(scene: Scene, config: FitConfig, lpips: bool = False) -> None:
+    """Check what needs no initial points, which can take a minute: device, backend, and the size of the images.
 
     Args:
-        plan: of :func:`make_plan`.
-        points: the initial points of the fit, of which "dense" and "sift" tell how many photos show the same surface.
+        scene: the scene to fit.
+        config: the settings of the fit.
+        lpips: whether LPIPS, which needs larger images, will be measured.
 
-    Returns:
-        The plan with its `decisions`; what the configuration gives stays as it is.
+    Raises:
+        TypeError: an argument is of another type.
+        DataError: images are too small.
+        ValueError, ModuleNotFoundError: as :func:`kgs.fit.plan.check_machine`.
     """
-    return decide_exposure(decide_degree(decide_by_overlap(plan, points), points), points)
+    check_kind("scene", scene, Scene)
+    check_kind("config", config, FitConfig)
+    check_machine(config)
+    smallest = min_side(config, lpips)
+    for views in (scene.train, scene.test):
+        height, width = views.images.shape[-2:]
+        if min(height, width) < smallest:
+            raise DataError(scene.root, "images", f"at least {smallest}x{smallest} pixels", f"{width}x{height}")
 
 
 def choose_points(scene: Scene, config: FitConfig, bar: ProgressBar = silent) -> InitialPoints:
@@ -64,11 +112,11 @@ def choose_points(scene: Scene, config: FitConfig, bar: ProgressBar = silent) ->
     kind = config.init
     if kind in ("scene", "model-points"):
         if len(scene.points) == 0:
-            reason = f"expected points of the layout itself for the init {kind!r}, got none"
-            raise DataError(scene.root, "points", reason)
+            raise DataError(scene.root, "points", f"points of the layout itself for the init {kind!r}", "none")
         if (kind == "model-points") != (scene.init_kind == "model-points"):
-            reason = f"expected points for the init {kind!r}, got {scene.init_kind!r}: load_scene(points=...) chooses"
-            raise DataError(scene.root, "points", reason)
+            expected = f"points for the init {kind!r}"
+            advice = "load_scene(points=...) chooses"
+            raise DataError(scene.root, "points", expected, quoted(scene.init_kind), advice=advice)
         check_in_view(scene.points, scene.train, scene.root)
         return InitialPoints(scene.points, scene.point_colors, scene.init_kind)
     views = scene.train if scene.train_full_size is None else scene.train_full_size

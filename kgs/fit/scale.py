@@ -22,7 +22,7 @@ def scaled_model(model: GaussianModel, factor: float) -> GaussianModel:
         ValueError: `factor` is not a finite number above 0.
     """
     _check(factor)
-    values = {name: parameter.detach() for name, parameter in model.named_parameters()}
+    values = {name: parameter.detach() for name, parameter in model.per_gaussian().items()}
     values["means"] = values["means"] * factor
     values["log_scales"] = values["log_scales"] + math.log(factor)
     return GaussianModel(**values, sh_degree=model.sh_degree, antialiased=model.antialiased)
@@ -51,7 +51,7 @@ def scaled(fit: Fit, factor: float) -> Fit:
 
 def _check(factor: float) -> None:
     if not (math.isfinite(factor) and factor > 0):
-        raise ArgumentError(f"factor: expected a finite number above 0, got {factor}")
+        raise ArgumentError("factor", "a finite number above 0", factor)
 
 
 def _scaled_scene(scene: Scene, factor: float) -> Scene:

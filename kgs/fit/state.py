@@ -11,7 +11,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from kgs._support.errors import ArgumentError
+from kgs._support.errors import ArgumentError, quoted
 from kgs._support.json_files import is_number
 from kgs.datasets.scene import Scene, Views
 from kgs.densify import Densifier
@@ -22,8 +22,8 @@ from kgs.init_points import InitialPoints
 from kgs.model import PARAMETERS, GaussianModel
 
 from .adam import Adam
-from .config import DROP, FitConfig
-from .plan import MANY, Plan, gaussian_limit
+from .config import Settings
+from .plan import Plan
 from .poses import MovingPoses
 
 # for each parameter the name of its learning rate in the recipe, without `lr_`
@@ -88,7 +88,7 @@ class TrainState:
         colors = points.colors.float()
         if scene.train.gains is not None and points.views is not None:
             colors = (colors / scene.train.gains[points.views]).clamp(0, 1)
-        model = GaussianModel.from_points(points.points.float(), colors, plan.config.sh_degree or 0)
+        model = GaussianModel.from_points(points.points.float(), colors, plan.config.sh_degree)
         model.sh_degree = 0
         start = Start(
             init={"kind": points.kind, "points": len(points.points)},
@@ -111,9 +111,8 @@ class TrainState:
         ]
         optimizer = Adam(groups, eps=recipe.adam_eps, backend=plan.backend)
         drop = None
-        rate = DROP if config.drop is None else config.drop
-        if rate:
-            drop = DropGaussian(rate, config.drop_schedule, seed=seed + 1, device=plan.device)
+        if config.drop:
+            drop = DropGaussian(config.drop, config.drop_schedule, seed=seed + 1, device=plan.device)
         densifier = Densifier(
             model,
             optimizer,
@@ -122,7 +121,7 @@ class TrainState:
             absgrad=recipe.absgrad,
             percent_dense=recipe.percent_dense,
             prune_opacity=recipe.prune_opacity,
-            max_gaussians=gaussian_limit(config, start.init["points"]),
+            max_gaussians=plan.max_gaussians,
             generator=torch.Generator().manual_seed(seed + 2),
             backend=plan.backend,
         )
@@ -172,11 +171,9 @@ class TrainState:
         """
         with state_errors():
             model = GaussianModel(**copy.deepcopy(values["model"]))
-            if model.max_sh_degree != (plan.config.sh_degree or 0) or model.means.dtype != torch.float32:
+            if model.max_sh_degree != plan.config.sh_degree or model.means.dtype != torch.float32:
                 given = f"{model.means.dtype} and degree {model.max_sh_degree}"
-                raise ArgumentError(
-                    f"model: expected float32 and harmonics of degree {plan.config.sh_degree}, got {given}"
-                )
+                raise ArgumentError("model", f"float32 and harmonics of degree {plan.config.sh_degree}", given)
             start = Start(*(copy.deepcopy(values[name]) for name in ("init", "extent", "near_plane", "depth")))
         state = cls._assemble(scene, plan, model, start)
         with state_errors():
@@ -200,15 +197,17 @@ class TrainState:
 
 @contextmanager
 def state_errors() -> Iterator[None]:
-    """Turn every error about an incomplete state into a ValueError that begins with the entry's name."""
+    """Turn every error about an incomplete state into an ArgumentError that names the entry."""
     try:
         yield
     except KeyError as error:
-        raise ArgumentError(f"{error.args[0]}: expected this entry in the state, got none") from error
+        raise ArgumentError(error.args[0], "this entry in the state", "none") from error
     except torch.OutOfMemoryError:  # says nothing about the state
         raise
-    except (AttributeError, RuntimeError, TypeError) as error:
-        raise ArgumentError(f"state: {error}") from error
+    except ArgumentError:
+        raise
+    except (AttributeError, RuntimeError, TypeError, ValueError) as error:
+        raise ArgumentError("state", "that of a fit", advice=str(error)) from error
 
 
 def fingerprint(scene: Scene) -> dict[str, Any]:
@@ -235,13 +234,14 @@ def digest(tensor: Tensor) -> str:
     return checksum.hexdigest()
 
 
-def check_saved(saved: dict[str, Any], scene: dict[str, Any], config: FitConfig, steps: int) -> list[str]:
+def check_saved(saved: dict[str, Any], scene: dict[str, Any], config: Settings) -> list[str]:
     """Raise KeyError, TypeError or ValueError unless a saved fit has this fingerprint, configuration and plain values.
 
     Returns notes for the user, if a finished fit goes on for more steps.
     """
     check_plain(saved, *PLAIN)
-    planned = saved["config"]["steps"] or MANY.steps
+    planned = saved["config"]["steps"]
+    steps = config.steps
     done = saved["step"]
     notes = list[str]()
     # a fit may continue on another device; its steps are compared below
@@ -255,8 +255,8 @@ def check_saved(saved: dict[str, Any], scene: dict[str, Any], config: FitConfig,
             f"from a fit of {steps} steps from the start"
         )
     elif planned != steps or done > planned:
-        expected = f"{planned}, as the fit was begun with," if done < planned else f"at least the {done} that are done,"
-        raise ArgumentError(f"steps: expected {expected} got {steps}")
+        expected = f"{planned}, as the fit was begun with" if done < planned else f"at least the {done} that are done"
+        raise ArgumentError("steps", expected, steps)
     _compare_settings(saved["config"] | {"backend": saved["backend"]}, asked)
     for part in ("training", "test"):
         for what, sums in scene[part].items():
@@ -267,25 +267,23 @@ def check_saved(saved: dict[str, Any], scene: dict[str, Any], config: FitConfig,
                 given = (
                     f"changed ones: {changed:.200}" if changed else f"{len(sums or [])} instead of {len(before or [])}"
                 )
-                raise ArgumentError(
-                    f"{what} of the {part} views: expected those that the fit was begun with, got {given}"
-                )
+                raise ArgumentError(f"{what} of the {part} views", "those that the fit was begun with", given)
     if saved["scene"]["background"] != scene["background"]:
-        raise ArgumentError("background: expected the colour that the fit was begun with; this scene has a changed one")
+        raise ArgumentError("background", "the colour that the fit was begun with", "another one")
     if max(saved["stack"], default=0) >= len(scene["training"]["names"]):
-        raise ArgumentError(f"stack: expected views of the scene, got {saved['stack']!s:.80}")
+        raise ArgumentError("stack", "views of the scene", saved["stack"])
     return notes
 
 
 def _compare_settings(saved: dict[str, Any], asked: dict[str, Any], path: str = "") -> None:
     for name, value in asked.items():
         if name not in saved:
-            raise ArgumentError(f"{path}{name}: expected a fit of this version of kgs, got one without this setting")
+            raise ArgumentError(f"{path}{name}", "a fit of this version of kgs", "one without this setting")
         before = saved[name]
         if isinstance(value, dict) and isinstance(before, dict):
             _compare_settings(before, value, f"{path}{name}.")
         elif before != value:
-            raise ArgumentError(f"{path}{name}: expected {before!r}, as the fit was begun with, got {value!r}")
+            raise ArgumentError(f"{path}{name}", f"{before!r}, as the fit was begun with", quoted(value))
 
 
 def check_plain(values: dict[str, Any], *names: str) -> None:
@@ -293,7 +291,7 @@ def check_plain(values: dict[str, Any], *names: str) -> None:
     for name in names:
         expected, is_right = PLAIN[name]
         if not is_right(values[name]):
-            raise ArgumentError(f"{name}: expected {expected}, got {str(values[name])[:80]!r}")
+            raise ArgumentError(name, expected, quoted(values[name]))
 
 
 _is_count = partial(is_number, minimum=0, whole=True)

@@ -8,8 +8,8 @@ import copy
 import math
 import os
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -20,7 +20,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs._support.checks import check_kind
-from kgs._support.errors import ArgumentError, DataError, TrainingDiverged
+from kgs._support.errors import ArgumentError, TrainingDiverged
 from kgs._support.torch_threads import threads_beside
 from kgs.backends import BACKENDS, resolve
 from kgs.datasets.scene import Scene, Views
@@ -30,29 +30,19 @@ from kgs.losses import photometric_loss
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 
-from .checkpoint import newest_checkpoint, previous, save_checkpoint
-from .config import FitConfig
+from .checkpoint import errors_of, newest_checkpoint, previous, save_checkpoint
+from .config import FitConfig, Settings
 from .decisions import Decisions
 from .divergence import bound_scales, gradient_fault, parameter_fault, scale_fault, step_fault
 from .exposure import with_exposure
 from .fit import Fit
 from .haze import FADE, veils
-from .plan import Plan, make_plan
+from .plan import Plan
 from .poses import decayed, with_extrinsics
-from .state import TrainState, check_saved, fingerprint, state_errors
+from .state import TrainState, check_plain, check_saved, fingerprint, state_errors
 from .targets import Target, background_of, targets
 
 _LOOK = 20  # steps between limits of the scales, and on a GPU between looks for faults: a read waits for all work
-
-
-@contextmanager
-def _errors_of(path: str | PathLike[str]) -> Iterator[None]:
-    """Turn a ValueError, which begins with the name of an entry, into an error about this checkpoint."""
-    try:
-        yield
-    except ValueError as error:
-        field, _, reason = str(error).partition(": ")
-        raise DataError(path, field, reason) from error
 
 
 class Trainer:
@@ -146,7 +136,7 @@ class Trainer:
         return Fit(
             scene=self.scene,
             model=state.model,
-            options=replace(self.renderer.options, alpha_threshold=RasterOptions.alpha_threshold),
+            options=replace(self.renderer.options, alpha_threshold=RasterOptions.alpha_threshold, absgrad=False),
             backend=self.plan.backend,
             settings=self.plan.config,
             history={
@@ -175,7 +165,7 @@ class Trainer:
         state = self.state
         schedule = self.plan.schedule
         if state.step >= schedule.steps:
-            raise ArgumentError(f"steps: expected a step of {schedule.steps} to be left, got none")
+            raise ArgumentError("steps", f"a step of {schedule.steps} to be left", "none")
         start = time.perf_counter()
         with threads_beside(self.plan.backend), torch.enable_grad():
             loss = self._optimize()
@@ -239,12 +229,12 @@ class Trainer:
         """
         plan = self.plan
         with state_errors():
-            longer = check_saved(values, self._fingerprint, plan.config, plan.schedule.steps)
+            longer = check_saved(values, self._fingerprint, plan.config)
             runs = next(x for x in BACKENDS if x.name == values["backend"]).runs_on(plan.device)
             backend = resolve(values["backend"] if runs else "auto", plan.device)
             decisions = Decisions.from_dict(values["decisions"])
             exposed = with_exposure(self._input_scene, decisions)
-        plan = replace(plan, backend=backend, decisions=decisions)
+            plan = replace(Plan.of(plan.config, values["init"]["points"], decisions), backend=backend)
         state = TrainState.from_dict(self._input_scene, plan, values)
         self.plan = plan
         state.notes += longer
@@ -282,19 +272,11 @@ class Trainer:
         check_kind("scene", scene, Scene)
         check_kind("config", config, FitConfig)
         values, damage = newest_checkpoint(Path(path))
-        try:
-            saved = values["config"]
-            names = ["sh_degree", "drop", *(["steps"] if "steps" in values["decisions"].get("overlap", {}) else [])]
-            decided = {name: saved[name] for name in names if getattr(config, name) is None}
-            decay = config.recipe.opacity_decay
-            if decay is None:  # more steps may have another
-                decay = saved["recipe"]["opacity_decay"]
-        except (KeyError, TypeError) as error:
-            raise DataError(path, "config", f"expected the configuration of a fit, got one without {error}") from error
-        with _errors_of(path):
-            config = replace(config, **decided, recipe=replace(config.recipe, opacity_decay=decay))
-        plan = make_plan(scene, config)
-        with _errors_of(path):
+        with errors_of(path), state_errors():
+            check_plain(values, "init")
+            settings = Settings.from_dict(values["config"]).of_resumed(config)
+        plan = Plan.of(settings, values["init"]["points"], Decisions())
+        with errors_of(path):
             trainer = cls(scene, plan, values)
         trainer.saved = f"{path} of step {trainer.step}"
         if damage:
@@ -363,9 +345,8 @@ class Trainer:
         state = self.state
         recipe = self.plan.config.recipe
         state.optimizer.step()
-        decay = recipe.opacity_decay
-        if decay is not None and decay < 1.0 and progress > recipe.decay_from:
-            state.densifier.decay_opacity(decay)
+        if recipe.opacity_decay < 1.0 and progress > recipe.decay_from:
+            state.densifier.decay_opacity(recipe.opacity_decay)
         if state.poses is not None:
             state.poses.step(progress)
 
@@ -379,7 +360,7 @@ class Trainer:
         state = self.state
         self._stop_if(scale_fault(state.model, state.start.extent))
         first = state.start.init["points"]
-        maximum = state.densifier.max_gaussians
+        maximum = self.plan.max_gaussians
         capped = state.densifier.step().capped
         if capped and maximum < 1.25 * first and maximum != self.plan.config.init_points:
             state.note(f"max_gaussians: {maximum} leaves little room beside the {first} initial points")

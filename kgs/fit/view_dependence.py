@@ -20,7 +20,6 @@ from kgs.init_points import InitialPoints
 from kgs.init_points.patches import MIN_PATCHES, PatchColors
 
 from .decisions import DegreeDecision
-from .plan import Plan
 
 DEGREE = 3  # of the harmonics that are chosen
 MIN_VIEWS = 4  # training views: three do not determine harmonics
@@ -32,31 +31,18 @@ MAX_APART = 4.0  # from a patch's median, in medians of all such differences
 FLAT_PRIOR = 1e3  # variance of a patch's colour without its dependence on the direction
 
 
-def decide_degree(plan: Plan, points: InitialPoints) -> Plan:
-    """Decide the degree of the harmonics, if the plan leaves it open.
-
-    Args:
-        plan: of the fit.
-        points: its initial points; without patches of at least four views the degree is 0.
-
-    Returns:
-        The plan with a degree; `decisions.sh_degree` says why.
-    """
-    if plan.config.sh_degree is not None:
-        return plan
+def decide_degree(points: InitialPoints) -> DegreeDecision:
+    """The degree of the harmonics, and why: 0 without initial points that have patches of at least four views."""
     patches = points.patches
     if patches is None:
-        why = f"no colours to compare with {points.kind} initial points"
-    elif patches.visible.shape[1] < MIN_VIEWS:
-        why = "too few views"
-    elif len(patches) < MIN_PATCHES:
-        why = "too little surface that three views agree on"
-    else:
-        gain = possible_gain(patches)
-        chosen = DEGREE if gain > MIN_GAIN else 0
-        found = DegreeDecision(chosen, "photos", over=DEGREE - chosen, gain=round(gain, 3), n=len(patches))
-        return plan.decided({"sh_degree": chosen}, sh_degree=found)
-    return plan.decided({"sh_degree": 0}, sh_degree=DegreeDecision(0, "rule", why))
+        return DegreeDecision(0, "rule", f"no colours to compare with {points.kind} initial points")
+    if patches.visible.shape[1] < MIN_VIEWS:
+        return DegreeDecision(0, "rule", "too few views")
+    if len(patches) < MIN_PATCHES:
+        return DegreeDecision(0, "rule", "too little surface that three views agree on")
+    gain = possible_gain(patches)
+    chosen = DEGREE if gain > MIN_GAIN else 0
+    return DegreeDecision(chosen, "photos", over=DEGREE - chosen, gain=round(gain, 3), n=len(patches))
 
 
 def possible_gain(patches: PatchColors) -> float:

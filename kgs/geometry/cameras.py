@@ -16,7 +16,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs._support.checks import check_intrinsic_rows, check_intrinsics, check_tensor
-from kgs._support.errors import ArgumentError
+from kgs._support.errors import ArgumentError, quoted
 
 from .camera_models import CameraModel
 
@@ -50,13 +50,11 @@ class PosedCamera:
         shape = tuple(self.extrinsics.shape)
         params = self.model.params
         if len(shape) != 3 or shape[1:] != (4, 4):
-            raise ArgumentError(f"extrinsics: expected shape (C, 4, 4), got {shape}")
+            raise ArgumentError("extrinsics", "shape (C, 4, 4)", shape)
         if not shape[0]:
-            raise ArgumentError("extrinsics: expected at least one camera, got none")
+            raise ArgumentError("extrinsics", "at least one camera", "none")
         if params.ndim == 2 and params.shape[0] not in (1, shape[0]):
-            raise ArgumentError(
-                f"model: expected params of 1 or {shape[0]} cameras as extrinsics, got {params.shape[0]}"
-            )
+            raise ArgumentError("model", f"params of 1 or {shape[0]} cameras as extrinsics", params.shape[0])
 
 
 Cameras = PinholeCamera | PosedCamera
@@ -94,17 +92,17 @@ def pinhole_cameras(
     check_tensor("viewmats", viewmats)
     check_tensor("Ks", Ks, viewmats, " as viewmats")
     if viewmats.ndim not in (2, 3) or viewmats.shape[-2:] != (4, 4):
-        raise ArgumentError(f"viewmats: expected shape (C, 4, 4) or (4, 4), got {tuple(viewmats.shape)}")
+        raise ArgumentError("viewmats", "shape (C, 4, 4) or (4, 4)", tuple(viewmats.shape))
     poses = viewmats.reshape(-1, 4, 4)
     count = poses.shape[0]
     shape = tuple(Ks.shape)
     if shape[-2:] not in ((3, 3), (4, 4)) or shape[:-2] not in ((), (1,), (count,)):
-        raise ArgumentError(f"Ks: expected shape ({count}, 3, 3), ({count}, 4, 4) or one matrix, got {shape}")
+        raise ArgumentError("Ks", f"shape ({count}, 3, 3), ({count}, 4, 4) or one matrix", shape)
     if pixel_centers not in ("integer", "half"):
-        raise ArgumentError(f'pixel_centers: expected "integer" or "half", got {pixel_centers!r}')
+        raise ArgumentError("pixel_centers", '"integer" or "half"', quoted(pixel_centers))
     for name, side in (("width", width), ("height", height)):
         if not (isinstance(side, int | np.integer) and side >= 1):
-            raise ArgumentError(f"{name}: expected an integer >= 1, got {side!r}")
+            raise ArgumentError(name, "an integer >= 1", quoted(side))
     traced = torch.compiler.is_compiling()  # then `project` checks
     if not traced:
         check_intrinsics("Ks", Ks)
@@ -261,7 +259,7 @@ def image_size(cameras: Cameras) -> tuple[int, int]:
     if not isinstance(cameras, PinholeCamera):
         return _model_size(cameras)
     if not len(cameras.extrinsics):
-        raise ArgumentError("cameras: expected at least one camera, got none")
+        raise ArgumentError("cameras", "at least one camera", "none")
     checked = _checked_sizes.get(cameras)
     if checked is not None and checked.versions == _versions(cameras):
         return checked.size
@@ -306,10 +304,10 @@ def _model_size(cameras: PosedCamera) -> tuple[int, int]:
 def _one_size(sizes: set[tuple[int, int]]) -> tuple[int, int]:
     """The only (height, width) of some; a ValueError if there are others, or it is not positive."""
     if len(sizes) != 1:
-        raise ArgumentError(f"cameras: expected one image size (height, width), got {sorted(sizes)}")
+        raise ArgumentError("cameras", "one image size (height, width)", sorted(sizes))
     ((height, width),) = sizes
     if height < 1 or width < 1:
-        raise ArgumentError(f"cameras: expected a positive image size, got {height}x{width}")
+        raise ArgumentError("cameras", "a positive image size", f"{height}x{width}")
     return height, width
 
 

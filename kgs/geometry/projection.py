@@ -21,7 +21,7 @@ def normals(gaussians: Gaussians, cameras: Cameras, projected: ProjectedGaussian
     At right angles to the view either direction is correct.
     """
     if gaussians.quats.ndim == 3 and axis is None:
-        raise ArgumentError("outputs: normals need quats (N, 4), got matrices, of which no column has to be an axis")
+        raise ArgumentError("outputs", "no normals of matrices, of which no column has to be an axis")
     ids = projected.gaussian_ids
     rotations = rotation_matrices(gaussians.quats.index_select(0, ids))
     if axis is None:
@@ -79,7 +79,7 @@ def _inverse(matrix: Tensor) -> Tensor:
     cofactors = (torch.linalg.cross(y, z), torch.linalg.cross(z, x), torch.linalg.cross(x, y))
     determinant = (x * cofactors[0]).sum()
     if bool((scale == 0) | (determinant == 0)):  # one wait on a GPU
-        raise ArgumentError("extrinsics: expected poses whose 3x3 block has an inverse, got one of determinant 0")
+        raise ArgumentError("extrinsics", "poses whose 3x3 block has an inverse", "one of determinant 0")
     inverse: Tensor = torch.stack(cofactors, 1) / determinant / scale
     return inverse
 

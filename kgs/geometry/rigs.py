@@ -29,7 +29,7 @@ def camera_extent(extrinsics: Tensor) -> float:
     """
     check_tensor("extrinsics", extrinsics)
     if extrinsics.ndim != 3 or extrinsics.shape[-2:] != (4, 4) or len(extrinsics) == 0:
-        raise ArgumentError(f"extrinsics: expected shape (C, 4, 4) with C >= 1, got {tuple(extrinsics.shape)}")
+        raise ArgumentError("extrinsics", "shape (C, 4, 4) with C >= 1", tuple(extrinsics.shape))
     centres = camera_centers(extrinsics)
     return 1.1 * float((centres - centres.mean(dim=0)).norm(dim=1).max())
 

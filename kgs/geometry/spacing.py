@@ -23,12 +23,12 @@ def log_spacing(points: Tensor) -> Tensor:
         points: `(N, 3)`, N >= 4, finite, not all in one place; else a ValueError.
     """
     if len(points) <= NEIGHBOURS:
-        raise ArgumentError(f"points: expected at least {NEIGHBOURS + 1} to take a spacing from, got {len(points)}")
+        raise ArgumentError("points", f"at least {NEIGHBOURS + 1} to take a spacing from", len(points))
     points = points.double()
     centred = points - points.mean(dim=0)
     size = centred.abs().amax()
     if not 0.0 < float(size) < math.inf:
-        raise ArgumentError(f"points: expected points in different places, got a cloud of half size {float(size):g}")
+        raise ArgumentError("points", "points in different places", f"a cloud of half size {float(size):g}")
     centred = centred / size  # float32 then suffices to find the neighbours, whatever the cloud's unit and position
     centred = centred.masked_fill(centred.abs() < 1e-100, 0.0)  # its square would be 0
     squared = _mean_squared_distance(centred)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from kgs._support.checks import check_kind, check_tensor
-from kgs._support.errors import ArgumentError
+from kgs._support.errors import ArgumentError, quoted
 from kgs._support.shown import ShownByShapes
 
 from .covariance import conics, variances
@@ -72,30 +72,28 @@ class RasterOptions:
     def __post_init__(self) -> None:
         for name in ("absgrad", "antialiased"):
             if not isinstance(getattr(self, name), bool):
-                raise ArgumentError(f"{name}: expected True or False, got {getattr(self, name)!r}")
+                raise ArgumentError(name, "True or False", quoted(getattr(self, name)))
         for name in ("tile_size", "max_bytes"):
             value: Any = getattr(self, name)
             if value is None:
                 continue
             if isinstance(value, bool) or not isinstance(value, Integral) or int(value) < 1:
-                raise ArgumentError(f"{name}: expected an integer >= 1, got {value!r}")
+                raise ArgumentError(name, "an integer >= 1", quoted(value))
             object.__setattr__(self, name, int(value))
         limits = {"near_plane": math.inf, "radius_clip": math.inf, "eps2d": math.inf}
         limits |= {"alpha_threshold": 1, "transmittance_stop": 1}
         for name, limit in limits.items():
             value = getattr(self, name)
             if not isinstance(value, Real) or not 0.0 <= float(value) < limit:
-                raise ArgumentError(f"{name}: expected a number in [0, {limit}), got {value!r}")
+                raise ArgumentError(name, f"a number in [0, {limit})", quoted(value))
             object.__setattr__(self, name, float(value))  # kernels are compiled for Python's floats, not NumPy's
         far: Any = self.far_plane
         if not isinstance(far, Real) or not self.near_plane < float(far):
-            raise ArgumentError(f"far_plane: expected more than the near plane, {self.near_plane}, got {far!r}")
+            raise ArgumentError("far_plane", f"more than the near plane, {self.near_plane}", quoted(far))
         object.__setattr__(self, "far_plane", float(far))
         if self.frame is not None:
             if not _is_frame(self.frame):
-                raise ArgumentError(
-                    f"frame: expected (left, top, right, bottom) with a positive size, got {self.frame!r}"
-                )
+                raise ArgumentError("frame", "(left, top, right, bottom) with a positive size", quoted(self.frame))
             object.__setattr__(self, "frame", tuple(map(float, self.frame)))
 
 
@@ -166,13 +164,13 @@ class Gaussians(ShownByShapes):
             got = tuple(getattr(self, name).shape)
             if got != (n, width) and (name, got) != ("quats", (n, 3, 3)):
                 rows = "N" if name == "means" else n
-                raise ArgumentError(f"{name}: expected shape ({rows}, {width}), got {got}")
+                raise ArgumentError(name, f"shape ({rows}, {width})", got)
         if self.opacities.ndim not in (1, 2) or self.opacities.shape[-1] != n:
-            raise ArgumentError(f"opacities: expected shape ({n},) or (C, {n}), got {tuple(self.opacities.shape)}")
+            raise ArgumentError("opacities", f"shape ({n},) or (C, {n})", tuple(self.opacities.shape))
         shape = tuple(self.colors.shape)
         fits = len(shape) == 2 or (len(shape) == 3 and shape[1] in SH_SIZES and shape[2] == 3)
         if not fits or shape[0] != n:
-            raise ArgumentError(f"colors: expected shape ({n}, D) or ({n}, K, 3) with K in {SH_SIZES}, got {shape}")
+            raise ArgumentError("colors", f"shape ({n}, D) or ({n}, K, 3) with K in {SH_SIZES}", shape)
 
     def __len__(self) -> int:
         return self.means.shape[0]

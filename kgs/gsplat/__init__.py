@@ -157,7 +157,7 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
         extra_signals_sh_degree=extra_signals_sh_degree,
     )
     if return_normals and covars is not None:
-        raise ArgumentError("return_normals: expected False where covars are given, they have no third axis")
+        raise ArgumentError("return_normals", "False where covars are given, they have no third axis")
     options = RasterOptions(
         tile_size=tile_size,
         near_plane=near_plane,
@@ -240,7 +240,7 @@ def _over(
     widths = [sums[name].shape[1] for name in names]
     check_tensor("backgrounds", backgrounds)
     if tuple(backgrounds.shape) != (*batch, sum(widths)):
-        raise ArgumentError(f"backgrounds: expected shape {(*batch, sum(widths))}, got {tuple(backgrounds.shape)}")
+        raise ArgumentError("backgrounds", f"shape {(*batch, sum(widths))}", tuple(backgrounds.shape))
     behind = backgrounds.reshape(-1, sum(widths))
     over = blend(torch.cat([sums[name] for name in names], 1), transmittance, behind, backend, "backgrounds")
     return dict(zip(names, over.split(widths, 1), strict=True))

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from kgs._support.errors import ArgumentError
+from kgs._support.errors import ArgumentError, quoted
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 LENSES = ("pinhole", "fisheye", "ortho")
@@ -37,15 +37,15 @@ def refuse(**given: Any) -> None:
         if name == "rolling_shutter" and getattr(value, "name", None) == "GLOBAL":
             continue
         if hasattr(value, "shape"):
-            raise ArgumentError(f"{name}: expected {default!r} ({why}), got an array {tuple(value.shape)}")
+            raise ArgumentError(name, f"{default!r} ({why})", f"an array {tuple(value.shape)}")
         if value != default:
-            raise ArgumentError(f"{name}: expected {default!r} ({why}), got {value!r}")
+            raise ArgumentError(name, f"{default!r} ({why})", quoted(value))
 
 
 def check_words(render_mode: str, rasterize_mode: str, camera_model: str) -> None:
     """Raise a ValueError for a word that gsplat does not have, or that kgs does not support."""
     if render_mode in RAY_DEPTH_MODES:
-        raise ArgumentError(f"render_mode: expected one of {RENDER_MODES} ({_FROM_3D}), got {render_mode!r}")
+        raise ArgumentError("render_mode", f"one of {RENDER_MODES} ({_FROM_3D})", quoted(render_mode))
     words = {
         "render_mode": (render_mode, RENDER_MODES),
         "rasterize_mode": (rasterize_mode, ("classic", "antialiased")),
@@ -53,4 +53,4 @@ def check_words(render_mode: str, rasterize_mode: str, camera_model: str) -> Non
     }
     for name, (word, known) in words.items():
         if word not in known:
-            raise ArgumentError(f"{name}: expected one of {known}, got {word!r}")
+            raise ArgumentError(name, f"one of {known}", quoted(word))

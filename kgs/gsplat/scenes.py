@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from kgs._support.checks import check_tensor
-from kgs._support.errors import ArgumentError
+from kgs._support.errors import ArgumentError, quoted
 from kgs.geometry.camera_models import camera_model
 from kgs.geometry.cameras import Cameras, PosedCamera, pinhole_cameras
 from kgs.geometry.covariance import covariance_factors
@@ -61,14 +61,14 @@ def batch_shape(means: Any, viewmats: Any) -> tuple[tuple[int, ...], int, int]:
         check_tensor(name, value, means if isinstance(means, Tensor) else None, " as means")
         if value.ndim <= len(ends) or tuple(value.shape[-len(ends) :]) != ends:
             kind = "(..., N, 3)" if name == "means" else "(..., C, 4, 4)"
-            raise ArgumentError(f"{name}: expected shape {kind}, got {tuple(value.shape)}")
+            raise ArgumentError(name, f"shape {kind}", tuple(value.shape))
     batch = tuple(means.shape[:-2])
     if not math.prod(batch):
-        raise ArgumentError(f"means: expected at least one scene, got shape {tuple(means.shape)}")
+        raise ArgumentError("means", "at least one scene", f"shape {tuple(means.shape)}")
     if not viewmats.shape[-3]:
-        raise ArgumentError(f"viewmats: expected at least one camera, got shape {tuple(viewmats.shape)}")
+        raise ArgumentError("viewmats", "at least one camera", f"shape {tuple(viewmats.shape)}")
     if tuple(viewmats.shape[:-3]) != batch:
-        raise ArgumentError(f"viewmats: expected shape {(*batch, 'C', 4, 4)}, got {tuple(viewmats.shape)}")
+        raise ArgumentError("viewmats", f"shape {(*batch, 'C', 4, 4)}", tuple(viewmats.shape))
     return batch, viewmats.shape[-3], means.shape[-2]
 
 
@@ -148,7 +148,7 @@ def _flat(name: str, value: Any, *shapes: tuple[int, ...], batch: tuple[int, ...
             flat: Tensor = value.reshape(math.prod(batch), *shape)
             return flat
     expected = " or ".join(str(batch + shape) for shape in shapes)
-    raise ArgumentError(f"{name}: expected shape {expected}, got {tuple(value.shape)}")
+    raise ArgumentError(name, f"shape {expected}", tuple(value.shape))
 
 
 def _harmonics(colors: Any, sh_degree: int | None, batch: tuple[int, ...], n: int, like: Tensor) -> Tensor | None:
@@ -156,14 +156,14 @@ def _harmonics(colors: Any, sh_degree: int | None, batch: tuple[int, ...], n: in
     if sh_degree is None:
         return None
     if not isinstance(sh_degree, int | np.integer) or sh_degree not in range(len(SH_SIZES)):
-        raise ArgumentError(f"sh_degree: expected 0 to {len(SH_SIZES) - 1} or None, got {sh_degree!r}")
+        raise ArgumentError("sh_degree", f"0 to {len(SH_SIZES) - 1} or None", quoted(sh_degree))
     check_tensor("colors", colors, like, " as means")
     minimum = SH_SIZES[sh_degree]
     shape = tuple(colors.shape)
     if shape[:-2] not in ((n,), (*batch, n)) or shape[-2] < minimum or shape[-1] != 3:
         shapes = " or ".join(dict.fromkeys(str((*part, n, "K", 3)) for part in ((), batch)))
         expected = f"{shapes} with K >= {minimum} for sh_degree {sh_degree}"
-        raise ArgumentError(f"colors: expected shape {expected}, got {shape}")
+        raise ArgumentError("colors", f"shape {expected}", shape)
     used: Tensor = colors[..., :minimum, :].reshape(math.prod(shape[:-3]), n, minimum, 3)
     return used
 

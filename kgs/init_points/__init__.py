@@ -9,7 +9,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs._support.checks import check_kind
-from kgs._support.errors import ArgumentError, warn
+from kgs._support.errors import ArgumentError, quoted, warn
 from kgs._support.machine import check_device
 from kgs._support.progress import ProgressBar, silent
 from kgs._support.shown import ShownByShapes
@@ -98,15 +98,15 @@ def initial_points(
     """
     check_kind("views", views, Views)
     if kind not in KINDS:
-        raise ArgumentError(f"kind: expected one of {list(KINDS)}, got {kind!r}")
+        raise ArgumentError("kind", f"one of {list(KINDS)}", quoted(kind))
     if draw not in DRAWS:
-        raise ArgumentError(f"draw: expected one of {list(DRAWS)}, got {draw!r}")
+        raise ArgumentError("draw", f"one of {list(DRAWS)}", quoted(draw))
     if count is not None and count < 1:
-        raise ArgumentError(f"count: expected at least 1, got {count}")
+        raise ArgumentError("count", "at least 1", count)
     where = check_device(str(device))
     if kind == "file":
         if file is None:
-            raise ArgumentError("file: expected a path for the kind 'file', got None")
+            raise ArgumentError("file", "a path for the kind 'file'", "None")
         return InitialPoints(*read_points(Path(file), origin), kind)
     cameras = to(views.cameras, "cpu", torch.float64)
     tracked = certain_points(views, cameras, bar, backend)

@@ -32,7 +32,7 @@ def read_points(path: Path, origin: Tensor | None = None) -> tuple[Tensor, Tenso
             is larger than 1 GiB, or than 64 MiB if it is text and no splat; or it has no points, or infinite ones.
     """
     if not path.is_file():
-        raise DataError(path, "", "expected a point cloud or mesh, found no such file")
+        raise DataError(path, "", "a point cloud or mesh", "no such file")
     with open(path, "rb") as file:
         head = file.read(2**13)
     is_ply = head.startswith(b"ply")
@@ -40,22 +40,22 @@ def read_points(path: Path, origin: Tensor | None = None) -> tuple[Tensor, Tenso
     binary_mark = rb"^format binary" if is_ply else rb"\0"
     is_text = not re.search(binary_mark, head, re.MULTILINE)
     if is_text and not is_splat:
-        _check_size(path, _MAX_TEXT_BYTES, ", the most for a text file")
+        _check_size(path, _MAX_TEXT_BYTES, " in a text file")
     else:
         _check_size(path, _MAX_BYTES)
     for magic, name in _ARCHIVES.items():
         if head.startswith(magic):
-            raise DataError(path, "", f"expected a point cloud or mesh, got a {name} archive: unpack it first")
+            raise DataError(path, "", "a point cloud or mesh", f"a {name} archive", advice="unpack it first")
     points, colors = _read_splat(path, origin) if is_splat else _read_cloud(path, origin)
     if not len(points) or not bool(points.isfinite().all()):
-        raise DataError(path, "vertices", f"expected finite points, at least one, got {len(points)}")
+        raise DataError(path, "vertices", "finite points, at least one", len(points))
     return points, colors
 
 
 def _check_size(path: Path, max_bytes: int, why: str = "") -> None:
     """Raise a DataError for a file of more than `max_bytes` bytes."""
     if path.stat().st_size > max_bytes:
-        raise DataError(path, "", f"is larger than {max_bytes // 2**20} MiB{why}")
+        raise DataError(path, "", f"at most {max_bytes // 2**20} MiB{why}", "more")
 
 
 def _read_splat(path: Path, origin: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -76,7 +76,7 @@ def _read_cloud(path: Path, origin: Tensor | None) -> tuple[Tensor, Tensor]:
         points = torch.tensor(geometry.vertices, dtype=torch.float64).reshape(-1, 3)
         colors = torch.tensor(geometry.visual.vertex_colors if geometry.visual.kind == "vertex" else [])
     except Exception as error:  # each of trimesh's readers raises whatever its parser does
-        raise DataError(path, "", f"expected a point cloud or mesh that trimesh reads, got {error!r}") from error
+        raise DataError(path, "", "a point cloud or mesh that trimesh reads", advice=repr(error)) from error
     if origin is not None:
         points = points - origin
     points = points.float()

@@ -23,9 +23,9 @@ def check_in_view(points: Tensor, views: Views, path: str | PathLike[str]) -> No
     depths, inside = points_in_images(points, views.cameras)
     if not bool(inside.any()):
         in_front = int((depths > 0).any(dim=1).sum())
-        counts = f"got none of {len(points)}, of which {in_front} lie before a camera"
+        counts = f"none of {len(points)}, of which {in_front} lie before a camera"
         advice = "are they in the frame of the scene's cameras?"
-        raise DataError(path, "initial points", f"expected some in a training image, {counts}: {advice}")
+        raise DataError(path, "initial points", "some in a training image", counts, advice=advice)
     has_points = inside.any(dim=0).tolist()
     empty = [name for name, has_some in zip(views.names, has_points, strict=True) if not has_some]
     if empty:

@@ -57,7 +57,7 @@ def sweep_depths(
     The sweep runs on `device`, None for a CPU; its results are on the CPU.
     """
     if not 0 < near < far < math.inf:
-        raise ArgumentError(f"near, far: expected 0 < near < far, got {near} and {far}")
+        raise ArgumentError("near, far", "0 < near < far", f"{near} and {far}")
     device = torch.device("cpu") if device is None else device
     grey = rgb_to_grayscale(views.images.to(device).float())[:, 0]
     planes = plane_count(planes_wanted(views, near, far))

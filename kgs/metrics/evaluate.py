@@ -76,9 +76,9 @@ def evaluate_images(
     for index, (name, image) in enumerate(zip(views.names, images, strict=True)):
         target = views.images[index : index + 1]
         if image.shape != target.shape:
-            raise ArgumentError(f"render: expected shape {tuple(target.shape)} for {name}, got {tuple(image.shape)}")
+            raise ArgumentError("render", f"shape {tuple(target.shape)} for {name}", tuple(image.shape))
         if not bool(image.isfinite().all()):
-            raise ArgumentError(f"render: expected finite values for {name}, got NaN or infinity")
+            raise ArgumentError("render", f"finite values for {name}", "NaN or infinity")
         shown, photo, share = views.compared(index, image)
         if correct_color is not None:
             valid = None if views.valid_mask is None else views.valid_mask[index]

@@ -83,9 +83,9 @@ class Lpips(nn.Module):
         ValueError for other shapes.
         """
         if image.ndim != 4 or image.shape[1] != 3 or min(image.shape[-2:]) < MIN_SIZE:
-            raise ArgumentError(f"image: expected shape (B, 3, H, W) with H, W >= {MIN_SIZE}, got {tuple(image.shape)}")
+            raise ArgumentError("image", f"shape (B, 3, H, W) with H, W >= {MIN_SIZE}", tuple(image.shape))
         if target.shape != image.shape:
-            raise ArgumentError(f"target: expected shape {tuple(image.shape)} as image, got {tuple(target.shape)}")
+            raise ArgumentError("target", f"shape {tuple(image.shape)} as image", tuple(target.shape))
         x = _network_input(image, rescale)
         y = _network_input(target, rescale)
         distance = image.new_zeros(len(image))
@@ -121,20 +121,20 @@ def _read(path: Path, shapes: dict[str, tuple[int, ...]]) -> dict[str, Tensor]:
         with zipfile.ZipFile(path) as archive:
             for field, shape in shapes.items():
                 if f"{field}.npy" not in archive.namelist():
-                    raise DataError(path, field, f"expected an array of shape {shape}, got none")
+                    raise DataError(path, field, f"an array of shape {shape}", "none")
                 with archive.open(f"{field}.npy") as file:
                     content = BytesIO(file.read(MAX_HEADER + 8 * math.prod(shape)))
                 array = np.lib.format.read_array(content, allow_pickle=False, max_header_size=MAX_HEADER)
                 if array.shape != shape or array.dtype.kind != "f" or content.read(1):
-                    raise DataError(path, field, f"expected floats of shape {shape}, got {array.dtype} {array.shape}")
+                    raise DataError(path, field, f"floats of shape {shape}", f"{array.dtype} {array.shape}")
                 with np.errstate(over="ignore"):
                     weights[field] = torch.from_numpy(np.array(array, np.float32, order="C"))
                 if not weights[field].isfinite().all():
                     raise DataError(
-                        path, field, "expected finite numbers in the range of float32, got NaN, infinity or larger ones"
+                        path, field, "finite numbers in the range of float32", "NaN, infinity or larger ones"
                     )
     except DataError:
         raise
     except Exception as error:  # damaged bytes raise whatever zipfile, its codecs and numpy's parser of headers raise
-        raise DataError(path, field, f"expected floats in a readable npz file, got {error!r}") from error
+        raise DataError(path, field, "floats in a readable npz file", advice=repr(error)) from error
     return weights

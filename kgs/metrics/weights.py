@@ -13,9 +13,9 @@ def weight_files(folder: str | PathLike[str]) -> tuple[Path, Path]:
     features = folder / "vgg16_features.npz"
     heads = folder / "lpips_lin_vgg16.npz"
     if not folder.is_dir():
-        raise DataError(folder, "", f"expected a folder with {features.name} and {heads.name}, got none")
+        raise DataError(folder, "", f"a folder with {features.name} and {heads.name}", "none")
     for path in (features, heads):
         if not zipfile.is_zipfile(path):
             got = "another format or a part of one" if path.is_file() else "none"
-            raise DataError(path, "", f"expected an npz file of LPIPS weights, got {got}")
+            raise DataError(path, "", "an npz file of LPIPS weights", got)
     return features, heads

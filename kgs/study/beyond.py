@@ -171,5 +171,5 @@ def _scene(name: str, views: int, downscale: float | None, data: str | None) -> 
     if name == ROOM:
         return synthetic_scene(views, CAMERAS, SIZE)
     if data is None:
-        raise DataError(name, "", "expected the environment variable KGS_DATA to name the folder of this scene")
+        raise DataError(name, "", "the environment variable KGS_DATA to name the folder of this scene")
     return from_the_middle(load_scene(Path(data) / name, downscale=downscale, hold_out=0), views)

@@ -4,7 +4,7 @@ import time
 import warnings
 from dataclasses import asdict, fields, replace
 from datetime import UTC, datetime
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +21,7 @@ from kgs.datasets.source import SceneSource
 from kgs.fit.config import PRESETS, FitConfig
 from kgs.fit.fit import Fit
 from kgs.fit.measures import measure
-from kgs.fit.plan import make_plan
-from kgs.fit.pruning import prune
-from kgs.fit.run import choose_points, decide
+from kgs.fit.run import Hooks, choose_points, fit_scene
 from kgs.fit.trainer import Trainer
 from kgs.init_points import InitialPoints
 from kgs.metrics.evaluate import MEASURES
@@ -86,9 +84,11 @@ def fit_and_measure(
     `rival` replaces random dropping.
     """
     begin = time.process_time()
-    plan = decide(make_plan(scene, config), points)
-    trainer = Trainer(scene, plan, points) if rival is None else RivalTrainer(scene, plan, points, rival)
-    fit = prune(trainer.fit(tell_steps()))
+    trainers = list[Trainer]()
+    make_trainer = Trainer if rival is None else partial(RivalTrainer, rival=rival)
+    hooks = Hooks(make_trainer=make_trainer, begun=trainers.append, after_step=tell_steps())
+    fit = fit_scene(scene, config, points=points, hooks=hooks)
+    (trainer,) = trainers
     cpu_seconds = time.process_time() - begin
     fit = fit.annotated(metrics=measure(fit, lpips))
     stored = {
@@ -99,7 +99,7 @@ def fit_and_measure(
         "curve": fit.history["curve"],
         "gaussians": len(fit.model),
         "decisions": fit.decisions.to_dict(),
-        "config": plan.config.to_dict() | ({} if rival is None else asdict(rival)),
+        "config": trainer.plan.config.to_dict() | ({} if rival is None else asdict(rival)),
         "seen": fit.metrics["seen"],
         "wall_seconds": fit.history["seconds"],
         "peak_rss_mb": peak_rss_mb(),
@@ -126,7 +126,7 @@ def _start(
     if name == SYNTHETIC:
         scene = synthetic_scene(train_views=views, size=(72, 96))
     elif data is None:
-        raise DataError(name, "", "expected the environment variable KGS_DATA to name the folder of this scene")
+        raise DataError(name, "", "the environment variable KGS_DATA to name the folder of this scene")
     else:
         points_of = start if start == "model-points" else "none"
         source = SceneSource(Path(data) / name)

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from kgs._support.errors import ArgumentError, DataError
+from kgs._support.errors import ArgumentError, DataError, quoted
 from kgs.app.cli.options import IfGiven, Out
 from kgs.app.cli.tools import check_installed, load_tools
 from kgs.fit.config import FitConfig
@@ -79,7 +79,7 @@ def study(
     reports = {"guard": ("guard.md", "guard.jsonl"), "beyond": ("beyond.md",)}
     check_free(out, "study", reports.get(preset, ("sparse.csv", "sparse.md", "index.html")))
     if table is not None and preset != "paper":
-        raise ArgumentError(f"table: expected the preset 'paper', which has the tables, got {preset!r}")
+        raise ArgumentError("table", "the preset 'paper', which has the tables", quoted(preset))
     FitConfig(steps=steps)
     if lpips_weights is not None:
         weight_files(lpips_weights)
@@ -118,7 +118,7 @@ def study(
         return 0
     if (report_only or read_rows(path)) and not finished_rows(cells, path):
         own = "give each preset and number of steps its own folder"
-        raise DataError(path, "", f"expected cells of {same}, got none; {own}")
+        raise DataError(path, "", f"cells of {same}", "none", advice=own)
     work = partial(
         do_cell,
         data=None if data is None else os.path.abspath(data),

@@ -16,7 +16,7 @@ from typing import Any
 from distributed import Client, KilledWorker, LocalCluster, Security, as_completed
 from distributed.core import rpc
 
-from kgs._support.errors import ArgumentError, DataError
+from kgs._support.errors import ArgumentError, DataError, quoted
 from kgs.app.files.locks import held
 
 from .running import Running
@@ -26,7 +26,7 @@ Work = Callable[[Cell], dict[str, Any]]
 _key = json.JSONEncoder(sort_keys=True).encode  # a cell as text
 PATIENCE = 10  # seconds for a scheduler to answer
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS")  # torch takes the second, which Dask sets to 1, before the first
-_LOST = "scheduler: expected it to stay until the last cell, got a lost connection; run again to go on"
+_LOST = ("scheduler", "one that stays until the last cell", "a lost connection")
 
 
 def run_grid(
@@ -60,9 +60,9 @@ def run_grid(
         DataError: another run writes the file, or a line of it is wrong.
     """
     if processes is not None and processes < 1:
-        raise ArgumentError(f"processes: expected at least 1, got {processes}")
+        raise ArgumentError("processes", "at least 1", processes)
     if len({_key(cell) for cell in cells}) < len(cells):
-        raise ArgumentError("cells: expected each one once, got two that are equal")
+        raise ArgumentError("cells", "each one once", "two that are equal")
     with _alone(path):
         done = {_key(row["cell"]) for row in read_rows(path, repair=True)}
         missing = [cell for cell in cells if _key(cell) not in done]
@@ -118,7 +118,7 @@ def _do(
         cell = cell_of.pop(future)
         running.end(future.key)
         if future.status in ("cancelled", "lost"):
-            raise ArgumentError(_LOST)
+            raise ArgumentError(*_LOST, advice="run again to go on")
         error = future.exception()
         if isinstance(error, KilledWorker) and not alone:
             suspects.append(cell)
@@ -149,7 +149,7 @@ def _threads(client: Client) -> int:
     try:
         return sum(client.nthreads().values())
     except OSError:
-        raise ArgumentError(_LOST) from None
+        raise ArgumentError(*_LOST, advice="run again to go on") from None
 
 
 def _append(path: Path, row: dict[str, Any]) -> None:
@@ -194,8 +194,8 @@ def _check_scheduler(address: str) -> None:
         answer = thread.submit(asyncio.run, _identify(address))
     kind = answer.exception() or answer.result()
     if kind != "Scheduler":
-        expected = "expected the address of a running Dask scheduler, as tcp://127.0.0.1:8786"
-        raise ArgumentError(f"scheduler: {expected}, got {address!r} ({kind!r})")
+        expected = "the address of a running Dask scheduler, as tcp://127.0.0.1:8786"
+        raise ArgumentError("scheduler", expected, f"{address!r} ({kind!r})")
 
 
 async def _identify(address: str) -> str:
@@ -221,11 +221,10 @@ def read_rows(path: Path, *, repair: bool = False) -> list[dict[str, Any]]:
             row = json.loads(line)
         except ValueError as error:
             if number < len(lines):
-                reason = f"expected JSON, got an error of its parser: {error}"
-                raise DataError(path, f"line {number}", reason) from error
+                raise DataError(path, f"line {number}", "JSON", advice=str(error)) from error
             break
         if not isinstance(row, dict) or not isinstance(row.get("cell"), dict):
-            raise DataError(path, f"line {number}", f"expected a cell and its result, got {line[:60]!r}")
+            raise DataError(path, f"line {number}", "a cell and its result", quoted(line))
         rows.append(row)
     if repair and lines:
         with path.open("r+b") as file:
@@ -248,5 +247,5 @@ def _alone(path: Path) -> Iterator[None]:
     path.parent.mkdir(parents=True, exist_ok=True)
     with held(path) as ours:
         if not ours:
-            raise DataError(path, "", "expected no other run to write this file, but one does")
+            raise DataError(path, "", "no other run that writes this file", "one")
         yield

@@ -28,7 +28,7 @@ def coadaptation(
     Source: "Quantifying and Alleviating Co-Adaptation in Sparse-View 3D Gaussian Splatting", arXiv 2508.12720.
     """
     if subsets < 2:
-        raise ArgumentError(f"subsets: expected at least 2, got {subsets}")
+        raise ArgumentError("subsets", "at least 2", subsets)
     renderer = GaussianRenderer(near_plane=near_plane)
     generator = torch.Generator().manual_seed(seed)
     gaussians = model()

@@ -115,13 +115,13 @@ def frame_of(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> pd.Da
 def cells_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """One line per cell, by scene; ValueError: no rows, or two that differ in the fit's settings or size alone."""
     if not rows:
-        raise ArgumentError("rows: expected at least one cell, got none")
+        raise ArgumentError("rows", "at least one cell", "none")
     frame = frame_of(rows, COLUMNS + _OTHERS)
     frame[COLUMNS] = frame[COLUMNS].astype(float).where(lambda numbers: numbers.abs() < math.inf)
     twice = frame.loc[frame.duplicated([*KEYS, "seed"]), [*KEYS, "seed"]].to_numpy()
     if len(twice):
         *group, seed = twice[0]
-        raise ArgumentError(f"rows: expected one cell for each seed of {tuple(group)}, got two for {seed}")
+        raise ArgumentError("rows", f"one cell for each seed of {tuple(group)}", f"two for {seed}")
     order = {name: k for k, name in enumerate([*frame.scene.unique(), *STARTS, *METHODS])}
 
     def rank(column: "pd.Series[Any]") -> "pd.Series[Any]":

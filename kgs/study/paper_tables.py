@@ -33,7 +33,7 @@ def cells_of_table(cells: Sequence[Cell], table: int, data: Path) -> list[Cell]:
         DataError: no cell is of the table, since `data` has none of its scenes, or they have too few photos.
     """
     if not 1 <= table <= len(TABLES):
-        raise ArgumentError(f"table: expected a number from 1 to {len(TABLES)}, got {table}")
+        raise ArgumentError("table", f"a number from 1 to {len(TABLES)}", table)
     benchmark, name = TABLES[table - 1]
     printed = PUBLISHED[(PUBLISHED.benchmark == benchmark) & (PUBLISHED.table == name)]
     settings = {*zip(printed.views, printed.method, strict=True)}
@@ -47,6 +47,6 @@ def cells_of_table(cells: Sequence[Cell], table: int, data: Path) -> list[Cell]:
     ]
     if not chosen:
         scenes = ", ".join(SCENES_OF[benchmark])
-        reason = f"expected a scene of {benchmark} ({scenes}) with photos enough for table {table}, got none"
-        raise DataError(data / layout, "", reason)
+        expected = f"a scene of {benchmark} ({scenes}) with photos enough for table {table}"
+        raise DataError(data / layout, "", expected, "none")
     return chosen

@@ -6,7 +6,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from kgs._support.errors import ArgumentError, DataError
+from kgs._support.errors import ArgumentError, DataError, quoted
 from kgs.bench.scenes import SYNTHETIC, check_scenes
 from kgs.datasets import load_scene
 from kgs.fit.config import FitConfig
@@ -74,7 +74,7 @@ def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
         data: the folder of the scenes: `llff/fern` and so on; DataError: None, or a scene is missing.
     """
     if preset not in _FITS:
-        raise ArgumentError(f"preset: expected one of {list(_FITS)}, got {preset!r}")
+        raise ArgumentError("preset", f"one of {list(_FITS)}", quoted(preset))
     if preset == "quick":
         scene = [(SYNTHETIC, 3)]
         blocks: list[Block] = [
@@ -84,7 +84,7 @@ def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
             ([0], scene, ["sift", "random"], [PAPER]),
         ]
     elif data is None:
-        raise DataError(Path("KGS_DATA"), "", f"expected this environment variable for the preset {preset!r}, got none")
+        raise DataError(Path("KGS_DATA"), "", f"this environment variable for the preset {preset!r}", "none")
     else:
         blocks_of = {"cpu": _cpu, "field": _field, "field-long": _field_long, "paper": _paper, "guard": _guard}
         blocks = blocks_of[preset](data)
@@ -134,11 +134,11 @@ def select(
         there = list(dict.fromkeys(cell[key] for cell in cells))
         for value in values:
             if value not in there:
-                raise ArgumentError(f"{name}: expected some of {there}, got {value!r}")
+                raise ArgumentError(name, f"some of {there}", quoted(value))
         chosen = [cell for cell in chosen if cell[key] in values]
     if not chosen:
         given = {name: list(values) for name, values in wanted.items() if values is not None}
-        raise ArgumentError(f"cells: expected one with {given}, got none; --list shows all of them")
+        raise ArgumentError("cells", f"one with {given}", "none", advice="--list shows all of them")
     return chosen
 
 
@@ -237,7 +237,7 @@ def _training_photos(path: Path) -> int:
 def _paper(data: Path) -> list[Block]:
     folders = _scenes_of_paper(data)
     if not folders:
-        raise DataError(data, "", f"expected scenes in folders named {sorted(VIEWS)}, found none")
+        raise DataError(data, "", f"scenes in folders named {sorted(VIEWS)}", "none")
     blocks: list[Block] = []
     for seed in range(5):
         for path in folders:

@@ -86,7 +86,7 @@ class SelectiveDrop(DropGaussian):
             return super().forward(opacities)
         rate = float(self.rate)
         if scores.shape != opacities.shape:
-            raise ArgumentError(f"scores: expected shape {tuple(opacities.shape)}, got {tuple(scores.shape)}")
+            raise ArgumentError("scores", f"shape {tuple(opacities.shape)}", tuple(scores.shape))
         if rate == 0.0:
             return opacities
         per_camera = scores.ndim > 1 and scores.shape[-1] > 1
@@ -124,9 +124,9 @@ def opacity_l1(opacities: Tensor, scores: Tensor) -> Tensor:
         A number in [0, 1]; 0 where there are no Gaussians.
     """
     if opacities.ndim != 1:
-        raise ArgumentError(f"opacities: expected shape (N,), got {tuple(opacities.shape)}")
+        raise ArgumentError("opacities", "shape (N,)", tuple(opacities.shape))
     if scores.shape != opacities.shape:
-        raise ArgumentError(f"scores: expected shape {tuple(opacities.shape)}, got {tuple(scores.shape)}")
+        raise ArgumentError("scores", f"shape {tuple(opacities.shape)}", tuple(scores.shape))
     ordered = scores.detach().sort().values
     below, not_above = (torch.searchsorted(ordered, scores.detach(), right=right) for right in (False, True))
     weights = (below + not_above).to(opacities.dtype) / (2 * max(len(scores), 1))

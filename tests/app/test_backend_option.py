@@ -69,7 +69,7 @@ def test_the_choice_is_kept_with_the_results(installed, scene, tmp_path, monkeyp
 
 @pytest.mark.parametrize(("begun", "other"), [("torch", "numba"), ("numba", "torch")])
 def test_a_resumed_fit_goes_on_with_what_it_was_begun_with(installed, scene, points, tmp_path, begun, other):
-    trainer = Trainer(scene, make_plan(scene, replace(CONFIG, backend=begun)), points)
+    trainer = Trainer(scene, make_plan(scene, replace(CONFIG, backend=begun), points), points)
     trainer.train_step()
     trainer.save(tmp_path / CHECKPOINT)
     for asked in ("auto", begun):

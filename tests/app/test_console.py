@@ -70,7 +70,7 @@ def test_a_reader_that_has_gone_ends_nothing(monkeypatch, kind):
 def test_control_characters_in_names_become_escapes(capsys):
     say("one\x1b[31m\ntwo\r")
     assert capsys.readouterr().out == "one\\x1b[31m\ntwo\\r\n"
-    assert str(DataError("a\nb", "c\nd", "is missing")) == "a\\nb: c\\nd: is missing"
+    assert str(DataError("a\nb", "c\nd", "a file")) == "a\\nb: c\\nd: expected a file"
     assert as_line("kgs", "a b", "it's\na \\") == r"kgs 'a b' $'it\'s\na \\'"
     assert as_line("d\udcff \x85é") == r"$'d\xff \xc2\x85é'"
     assert as_line("kgs", Path("./-a"), "-o", Path("b")) == "kgs ./-a -o b"

@@ -103,7 +103,7 @@ def demo(tmp_path_factory, points):
     """The results of a tiny demo, and what was said; nobody changes them."""
     out = tmp_path_factory.mktemp("demo") / "out"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("kgs.app.fit_folder.choose_points", lambda *_: points)
+        patch.setattr("kgs.fit.run.choose_points", lambda *_: points)
         assert run("demo", "-o", out, "--steps", 2, *TINY) == 0
     return out
 
@@ -160,7 +160,7 @@ def test_sizes_that_cannot_be_fitted_and_photos_of_others_are_refused(demo, fold
     (tmp_path / "images").mkdir()
     (tmp_path / "images" / "mine.jpg").touch()
     assert run("demo", "-o", tmp_path) == 3
-    assert "holds images/mine.jpg, which this command did not write" in one_line(capsys)
+    assert "got images/mine.jpg: move it away" in one_line(capsys)
     assert run("fit", folder, "-o", demo) == 3
     assert "choose another folder" in one_line(capsys)
     assert [path.name for path in tmp_path.iterdir()] == ["images"]

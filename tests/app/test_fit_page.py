@@ -48,7 +48,7 @@ def fitted(points: Any, tmp_path_factory: Any) -> Any:
     scene = replace(synthetic_scene(train_views=3, test_views=8, size=(24, 32), seed=0), root=out)
     (out / "photos.json").write_text(json.dumps(REPORT))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(app, "choose_points", lambda *_: points)
+        patch.setattr("kgs.fit.run.choose_points", lambda *_: points)
         return out, app.fit_folder(scene, CONFIG, out, REQUEST, say=lambda line: None).fit
 
 
@@ -173,7 +173,7 @@ def done(measured: Path, tmp_path: Path) -> Path:
 def test_eval_refuses_a_page_that_the_user_changed(done: Path, capsys: Any) -> None:
     page = (done / "index.html").read_bytes()
     (done / "index.html").write_text("mine")
-    with pytest.raises(DataError, match=r"holds index\.html, which this command did not write"):
+    with pytest.raises(DataError, match=r"got index\.html: move it away"):
         evaluate(done)
     (done / "index.html").write_bytes(page)
     evaluate(done)

@@ -23,9 +23,7 @@ from kgs.app.sfm import pose_photos
 from kgs.datasets import load_scene
 from kgs.datasets.scene import Views
 from kgs.fit.config import DEMO
-from kgs.fit.plan import make_plan
-from kgs.fit.run import choose_points
-from kgs.fit.trainer import Trainer
+from kgs.fit.run import fit_scene
 from kgs.geometry.types import RasterOptions
 
 SIZE = (150, 200)  # height, width
@@ -275,8 +273,7 @@ def test_a_drag_in_a_real_scene_shows_what_kgs_renders(
         pose_photos(kgs_data / name, folder)
     wide = max(load_scene(folder, 6, hold_out=0, photos=False).train.images.shape[-2:])
     real = load_scene(folder, 6, wide / 200, hold_out=0)
-    config = replace(DEMO, steps=100)
-    fit = Trainer(real, make_plan(real, config), choose_points(real, config)).fit()
+    fit = fit_scene(real, replace(DEMO, steps=100, prune=False))
     path = tmp_path / "index.html"
     near_plane = fit.options.near_plane
     write_fit_page(path, name, {"": fit}, photos=False)

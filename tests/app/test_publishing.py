@@ -60,7 +60,7 @@ def unfinished(out: Path, files: dict[str, str], kind: str = "demo") -> Path:
 
 def refused(*names: str) -> Any:
     """Expects an error that names these files and says what to do."""
-    said = f"holds {', '.join(names)}, which this command did not write, or which was changed since: move it away"
+    said = f", or that was changed since, got {', '.join(names)}: move it away"
     return pytest.raises(DataError, match=re.escape(said))
 
 
@@ -330,7 +330,7 @@ def test_what_is_no_marker_is_refused_and_stays(out: Path, content: str | None) 
     write(out, {f"{MARKER}/notes.txt": "mine"} if content is None else {MARKER: content})
     for act in (lambda: check_free(out, "demo", NEW), lambda: replace_all(out, NEW), lambda: is_own(out, "a.txt")):
         with pytest.raises(
-            DataError, match="is no marker of this version of kgs: remove it, or choose another"
+            DataError, match="expected a marker of this version of kgs, got another file: remove it, or choose another"
         ) as error:
             act()
         assert error.value.path == out / MARKER
@@ -344,7 +344,7 @@ def test_a_marker_that_is_a_link_is_refused(out: Path, tmp_path: Path) -> None:
     farm.mkdir()
     (farm / MARKER).symlink_to(out / MARKER)
     before = (out / MARKER).read_bytes()
-    with pytest.raises(DataError, match="is no marker"):
+    with pytest.raises(DataError, match="expected a marker"):
         replace_all(farm, NEW)
     assert (out / MARKER).read_bytes() == before
 
@@ -437,5 +437,5 @@ def test_no_command_replaces_a_file_of_the_user_or_of_another_command(
         write(tmp_path, {name: "mine"})
     given = [word.format(scene=folder, fit=fitted, out=tmp_path) for word in words.split()]
     assert run(*given) == 3
-    assert f"holds {name}, which this command did not write" in one_line(capsys)
+    assert f"nothing that this command did not write, or that was changed since, got {name}" in one_line(capsys)
     assert contents(tmp_path) == {name: "mine"}

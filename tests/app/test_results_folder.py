@@ -30,7 +30,6 @@ from kgs.fit import measures
 from kgs.fit import trainer as trainer_module
 from kgs.fit.checkpoint import load_checkpoint, previous, save_checkpoint
 from kgs.fit.config import DROP, FitConfig, Recipe
-from kgs.fit.plan import with_step_defaults
 from kgs.fit.pruning import prune
 from kgs.fit.trainer import Trainer
 
@@ -42,7 +41,7 @@ OTHER = replace(CONFIG, seed=1)
 def _few_points(scene: Any, points: Any) -> Any:
     """The same initial points; and every folder's scene is the one of these tests."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(app, "choose_points", lambda *_: points)
+        patch.setattr("kgs.fit.run.choose_points", lambda *_: points)
         patch.setattr(SceneRequest, "load", lambda *_: scene)
         yield
 
@@ -193,7 +192,7 @@ def test_a_forged_checkpoint_is_refused(done: Path, changes: dict[str, Any], fie
     previous(path).unlink(missing_ok=True)
     with pytest.raises(DataError) as error:
         load_fit(done)
-    assert (error.value.path, error.value.field) == (path, field)
+    assert (error.value.path, error.value.key) == (path, field)
 
 
 def killed_before_the_move(out: Path, patch: Any) -> None:
@@ -337,7 +336,7 @@ def test_an_unfinished_fit_is_gone_on_with_or_the_next_one_is_refused(scene: Any
     before = contents(done)
     for check in (lambda: fit(scene, OTHER, done), lambda: check_fit_files(done, resume=False)):
         with pytest.raises(
-            DataError, match="holds a fit that is not done: go on with it by --resume, or remove"
+            DataError, match="a fit that is done, got one that is not: go on with it by --resume, or remove"
         ) as error:
             check()
         assert error.value.path == work
@@ -366,10 +365,10 @@ def test_a_file_that_the_user_writes_during_a_fit_is_not_replaced_and_no_trainin
 
     with monkeypatch.context() as patch:
         patch.setattr(Trainer, "_optimize", meanwhile)
-        with pytest.raises(DataError, match=f"holds {mine.name}, which this command did not write"):
+        with pytest.raises(DataError, match=f"got {mine.name}: move it away"):
             fit(scene, OTHER, done)
     assert json.loads((done / "metrics.json").read_text())["seed"] == 0
-    with pytest.raises(DataError, match=f"holds {mine.name}, which"):
+    with pytest.raises(DataError, match=f"got {mine.name}: move it away"):
         fit(scene, OTHER, done, resume=True)
     assert mine.read_text() == "mine"
     mine.unlink()
@@ -410,8 +409,7 @@ def interrupt_at(step: int, patch: Any) -> None:
 def test_a_fit_is_done_after_the_steps_that_the_photos_decided(
     scene: Any, done: Path, monkeypatch: Any, decided: int, interrupted: bool
 ) -> None:
-    """Not after those of the plan before, which are 3."""
-    monkeypatch.setattr(app, "decide", lambda plan, _: plan.decided({"steps": decided}))
+    monkeypatch.setattr("kgs.fit.plan.decide_by_overlap", lambda *_: (decided, DROP, None))
     if interrupted:
         interrupt_at(3, monkeypatch)
     fit(scene, OTHER, done)
@@ -476,7 +474,7 @@ def test_what_another_program_or_person_made_stays(
     mine.parent.mkdir(exist_ok=True)
     mine.write_text("mine")
     if is_refused:
-        monkeypatch.setattr(app, "choose_points", None)
+        monkeypatch.setattr("kgs.fit.run.choose_points", None)
         with pytest.raises(DataError, match="move it away|remove this folder"):
             fit(scene, CONFIG, tmp_path)
         assert contents(tmp_path) in ({name: b"mine"}, {name: b"mine", ".lock": b""})
@@ -499,11 +497,21 @@ def test_images_that_are_too_small_are_refused_before_any_work(tmp_path: Path) -
     assert not (tmp_path / "out").exists()
 
 
-def test_a_saved_fit_renders_what_the_trainer_did(scene: Any, done: Path) -> None:
-    request, saved = load_fit(done)
-    trainer = Trainer.resume(scene, CONFIG, done / CHECKPOINT)
-    assert trainer.plan.config == with_step_defaults(replace(CONFIG, drop=DROP), len(scene.train))
-    assert (saved.settings, request) == (trainer.plan.config, SceneRequest("/photos", 3))
-    assert saved.metrics == json.loads((done / "metrics.json").read_text())
+def test_a_loaded_fit_is_the_one_that_was_saved(scene: Any, tmp_path: Path) -> None:
+    made = app.fit_folder(scene, CONFIG, tmp_path, SceneRequest("/photos", 3), say=lambda _: None).fit
+    request, saved = load_fit(tmp_path)
+    assert request == SceneRequest("/photos", 3)
+    for name in ("options", "backend", "settings", "decisions", "notes"):
+        assert getattr(saved, name) == getattr(made, name), name
+    assert saved.decisions.gaussians is not None
+    for name in ("history", "metrics"):
+        assert getattr(saved, name) == json.loads(json.dumps(getattr(made, name))), name
+    assert (saved.part["sh_degree"], saved.part["rows"].tolist()) == (
+        made.part["sh_degree"],
+        made.part["rows"].tolist(),
+    )
     camera = scene.test.camera(0)
+    assert torch.equal(saved.render(camera), made.render(camera))
+    trainer = Trainer.resume(scene, CONFIG, tmp_path / CHECKPOINT)
     assert torch.equal(saved.render(camera), prune(trainer.result()).render(camera))
+    assert measures.measure(saved)["test"] == saved.metrics["test"]

@@ -15,8 +15,6 @@ from kgs.datasets.image_file import ImageFile, is_heic
 
 pi_heif = pytest.importorskip("pi_heif")
 
-P3_TO_SRGB = np.array([[1.2249402, -0.2249402, 0.0], [-0.0420569, 1.0420569, 0.0], [-0.0196376, -0.0786361, 1.0982736]])
-BT2020_TO_SRGB = np.array([[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]])
 # 64x48 pixels of red 4 x, green 5 y and blue 255 - 2 x, stored lying, to be turned by 90 degrees; 26 mm as on film.
 PHOTO = zlib.decompress(
     base64.b85decode(
@@ -52,45 +50,22 @@ def test_pixels_are_upright_and_the_lens_is_known(folder):
         assert photo.focal == pytest.approx(26 / np.hypot(36, 24) * np.hypot(48, 64))
 
 
-def test_one_that_exif_alone_turns_is_turned(folder):
-    alone = PHOTO.replace(b"irot", b"free")  # a box that says nothing
-    (folder / "IMG_2.HEIC").write_bytes(alone)
-    upright, turned, _ = read_photos(open_photos(find_photos(folder)), silent)
-    assert turned.exif.orientation == 6
-    assert turned.size == (48, 64)
-    np.testing.assert_array_equal(turned.pixels, upright.pixels)
-
-
 def with_nclx(primaries: int, curve: int) -> bytes:
     at = PHOTO.index(b"colrnclx") + 8
     return PHOTO[:at] + bytes([0, primaries, 0, curve]) + PHOTO[at + 4 :]
 
 
-def test_colours_are_those_that_its_numbers_say(folder):
-    """The primaries of Display P3, and of BT.2020, whose reds are outside of sRGB."""
-    red = []
-    for primaries in (1, 12, 9):
-        (folder / "IMG_2.HEIC").write_bytes(with_nclx(primaries, 13))
-        pixels = ImageFile(folder / "IMG_2.HEIC").read()
-        red.append(pixels[24, 40])
-    light = np.where(red[0] <= 0.04045, red[0] / 12.92, ((red[0] + 0.055) / 1.055) ** 2.4)
-    for matrix, found in ((P3_TO_SRGB, red[1]), (BT2020_TO_SRGB, red[2])):
-        moved = np.clip(matrix @ light, 0, 1)
-        expected = np.where(moved <= 0.0031308, moved * 12.92, 1.055 * moved ** (1 / 2.4) - 0.055)
-        assert np.abs(expected - red[0]).max() > 0.03
-        np.testing.assert_allclose(found, expected, atol=2e-3)
-
-
-def test_numbers_that_say_nothing_change_nothing(folder):
-    (folder / "IMG_2.HEIC").write_bytes(with_nclx(2, 2))
+@pytest.mark.parametrize("numbers", [(2, 2), (1, 1), (1, 13), (5, 6)])
+def test_numbers_that_mean_srgb_or_nothing_change_nothing(folder, numbers):
+    (folder / "IMG_2.HEIC").write_bytes(with_nclx(*numbers))
     np.testing.assert_array_equal(ImageFile(folder / "IMG_2.HEIC").read(), ImageFile(folder / "IMG_1.heic").read())
 
 
-@pytest.mark.parametrize(("curve", "name"), [(16, "PQ"), (18, "HLG")])
-def test_hdr_is_refused(folder, curve, name):
-    (folder / "IMG_2.HEIC").write_bytes(with_nclx(9, curve))
-    with pytest.raises(DataError, match=rf"IMG_2\.HEIC: expected a photo of standard range, got HDR \({name}\)"):
-        read_photos(open_photos(find_photos(folder)), silent)
+@pytest.mark.parametrize("numbers", [(9, 16), (9, 18), (12, 13), (9, 13), (1, 8)])
+def test_numbers_of_other_colours_are_refused(folder, numbers):
+    (folder / "IMG_2.HEIC").write_bytes(with_nclx(*numbers))
+    with pytest.raises(DataError, match=r"IMG_2\.HEIC: .*convert it to 8-bit RGB"):
+        open_photos(find_photos(folder))
 
 
 @pytest.mark.parametrize("end", [40, 300, 640])
@@ -103,17 +78,17 @@ def test_a_damaged_one_is_named(folder, end):
 def test_a_bomb_is_not_decoded(folder, monkeypatch):
     for name, value in (("size", (2**15, 2**15)), ("width", 2**15), ("height", 2**15)):
         monkeypatch.setattr(pi_heif.HeifImageFile, name, value)
-    with pytest.raises(DataError, match="32768x32768 pixels in 71[456] bytes: a decompression bomb"):
+    with pytest.raises(DataError, match="in 71[456] bytes, got 32768x32768: it is a decompression bomb"):
         read_photos(open_photos(find_photos(folder)), silent)
 
 
 def test_without_the_extra_it_is_said_what_to_do(folder, monkeypatch):
     monkeypatch.setattr(folders, "has_heic", lambda: False)
-    said = r"2 of 3 photos cannot be read \(IMG_1\.heic, IMG_2\.HEIC\).*\[heic\].*sips.*magick.*Most Compatible"
+    said = r"2 of 3 of another kind \(IMG_1\.heic, IMG_2\.HEIC\).*\[heic\].*sips.*magick.*Most Compatible"
     with pytest.raises(DataError, match=said):
         find_photos(folder)
     assert [path.name for path in list_photos(folder)] == ["IMG_3.jpg"]
-    with pytest.raises(DataError, match=r"IMG_3\.jpg: is a HEIC photo or a video"):
+    with pytest.raises(DataError, match=r"IMG_3\.jpg: .* got a HEIC photo or a video"):
         open_photos([folder / "IMG_3.jpg"])
 
 

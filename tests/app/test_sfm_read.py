@@ -77,6 +77,27 @@ def test_a_focal_length_in_millimetres_counts_where_the_density_of_pixels_is_kno
     assert read_exif(tmp_path, with_exif(JPEG, exif(focal=5))).focal_ratio(4000, 3000) is None
 
 
+@pytest.mark.parametrize(
+    ("film", "over_width", "expected"),
+    [
+        (28, None, 28 / 36),
+        (1, None, None),
+        (7, None, None),
+        (8, None, 8 / 36),  # a fisheye
+        (360, None, 10),
+        (720, None, None),
+        (None, 0.1, None),  # of a sensor of another size
+        (None, 20, None),
+        (1, 0.8, 0.8),
+    ],
+)
+def test_a_focal_length_that_no_lens_has_is_passed_over(tmp_path, film, over_width, expected):
+    (photo,) = opened(tmp_path, planes()[:1], [0])
+    photo = photo._replace(exif=Exif(1, film, over_width), size=(3600, 2400))
+    assert photo.focal_ratio == (expected and pytest.approx(expected))
+    assert photo.has_odd_focal == (expected is None)
+
+
 def test_nothing_and_damage_are_no_metadata(tmp_path):
     block = exif(orientation=6, film=28, focal=5, density=5000, width=4000)
     whole = read_exif(tmp_path, with_exif(JPEG, block))
@@ -111,7 +132,7 @@ def test_a_panorama_is_refused_and_how_to_cut_it_is_said(tmp_path, kind):
         (tmp_path / f"{i}.jpg").write_bytes(jpeg[:2] + tag + jpeg[2:])
     photos = open_photos(sorted(tmp_path.iterdir()))
     assert all(photo.is_panorama for photo in photos)
-    with pytest.raises(DataError, match=r"0\.jpg: is a panorama.*v360"):
+    with pytest.raises(DataError, match=r"0\.jpg: .* got a panorama: .*v360"):
         unlike_others(photos)
     plain = tmp_path / "plain.png"
     cv2.imwrite(str(plain), ahead)
@@ -153,7 +174,7 @@ def test_of_a_photo_of_another_shape_the_middle_is_taken(tmp_path):
     cv2.imwrite(str(tmp_path / "masks" / "IMG_5.png"), mask)
     photos = read_photos(opened(tmp_path, images, films), silent)
     assert [photo.size for photo in photos] == [photos[0].size] * 7
-    assert [photo.whole is None for photo in photos] == [True] * 3 + [False] * 4
+    assert [photo.is_cut for photo in photos] == [False] * 3 + [True] * 4
     assert len({photo.lens for photo in photos[:3]}) == 1
     assert len({photo.lens for photo in photos}) == 4  # 240x120 is there upright and lying
     width, height = photos[0].size

@@ -87,7 +87,7 @@ def test_a_folder_of_photos_becomes_a_fit(folder, tmp_path, capsys, monkeypatch)
     said = capsys.readouterr().out
     stages = ["1 of 5: cameras", "2 of 5: initial points", "3 of 5: fit", "4 of 5: film", "5 of 5: page"]
     assert [line for line in said.splitlines() if " of 5: " in line] == stages
-    assert said.index(stages[0]) < said.index("reconstruction.json is not used") < said.index(stages[1])
+    assert said.index(stages[0]) < said.index("reconstruction.json") < said.index(stages[1])
     assert "4 training photos of 96x72, none held out" in said
     assert "<title>photos4</title>" in (out / "index.html").read_text(encoding="utf-8")
     assert "no photo was held out" in said
@@ -114,8 +114,8 @@ def test_cameras_alone_make_a_scene_that_is_fitted_as_its_photos_are(folder, tmp
     assert splats[0] == splats[1]
     capsys.readouterr()
     for source, out, said in (
-        (scene, tmp_path / "more", "has camera poses"),
-        (photos, tmp_path / "of photos4", "holds a fit"),
+        (scene, tmp_path / "more", "photos without camera poses, got a scene"),
+        (photos, tmp_path / "of photos4", "expected a folder without a fit"),
     ):
         assert run("poses", source, "-o", out) == 3
         assert said in one_line(capsys)
@@ -128,7 +128,7 @@ def test_half_of_the_steps_are_coarse_at_the_size_that_the_command_chooses(folde
 
     def fit_folder(scene, config, *args, **kwargs):
         seen.append(config.coarse)
-        raise DataError(tmp_path, "", "enough")
+        raise DataError(tmp_path, "", "no more")
 
     monkeypatch.setattr("kgs.app.fit_folder.fit_folder", fit_folder)
     photos = folder(4)

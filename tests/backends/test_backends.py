@@ -66,7 +66,7 @@ def test_the_tile_size_is_the_backends_own_unless_it_is_given(half, backend, own
 
 
 def test_a_backend_by_name_is_refused_where_it_does_not_cover_the_call(half):
-    with pytest.raises(ValueError, match=r"backend: 'half' does not cover this call of compositing"):
+    with pytest.raises(ValueError, match=r"for this call of compositing, got 'half'"):
         render(9, "half")
 
 
@@ -84,7 +84,7 @@ def test_kernels_beside_the_renderer_are_numbas_unless_torch_is_named(half):
     takes = {name: backends.takes_kernels(name, "rows", rows) for name in backends.available()}
     assert takes == {"auto": True, "half": True, "numba": True, "torch": False, "triton": True}
     assert not backends.takes_kernels("auto", "rows", rows.double())
-    with pytest.raises(ValueError, match="backend: 'numba' does not cover this call of rows"):
+    with pytest.raises(ValueError, match="for this call of rows, got 'numba'"):
         backends.takes_kernels("numba", "rows", rows.double())
 
 

@@ -62,6 +62,21 @@ def test_foreign_parameters_are_left_alone_and_frozen_ones_stay_frozen():
     assert [name for name, p in model.named_parameters() if not p.requires_grad] == ["quats"]
 
 
+@pytest.mark.parametrize("rows", [2, 3, 200])
+def test_parameters_that_are_not_of_gaussians_stay_as_they_are(rows):
+    model, _, _ = make([SMALL, LARGE])
+    model.network = torch.nn.Linear(5, rows)
+    adam = torch.optim.Adam(model.parameters())
+    densifier = Densifier(model, adam, 100.0)
+    before = {name: value.clone() for name, value in model.network.named_parameters()}
+    densifier.observe(seen(model, [0, 1], [(1, 0), (1, 0)]))
+    assert densifier.step().total == 4
+    assert {name: tuple(value.shape) for name, value in model.per_gaussian().items()}["means"] == (4, 3)
+    for name, value in model.network.named_parameters():
+        assert torch.equal(value, before[name])
+        assert any(value is held for held in adam.param_groups[0]["params"])
+
+
 def test_opacity_reset_lowers_only_what_is_above_and_zeroes_only_its_moments():
     model, adam, densifier = make([SMALL] * 3, [0.9, 0.006, 0.5])
     for _ in range(2):

@@ -96,7 +96,7 @@ def test_a_fit_renders_the_scene_without_the_border(scene):
     edges = []
     for views in (scene, with_border(scene, light), with_border(scene, light, known=False)):
         trainer = Trainer(
-            views, make_plan(views, FitConfig(steps=200, evaluations=1, training_background="scene")), points
+            views, make_plan(views, FitConfig(steps=200, evaluations=1, training_background="scene"), points), points
         )
         trainer.fit()
         edges.append(float(trainer.render(scene.train.camera(0))[..., :2].mean()))

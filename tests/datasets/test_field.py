@@ -76,5 +76,5 @@ def test_images_of_blender_are_halved(tmp_path):
 
 
 def test_a_folder_that_is_no_scene_is_refused(tmp_path):
-    with pytest.raises(DataError, match="is not a scene"):
+    with pytest.raises(DataError, match="expected a scene"):
         field_size(tmp_path)

@@ -8,10 +8,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from tiny_scenes import read_image
 
 from kgs._support.errors import DataError
 from kgs.datasets.folders import image_folder, list_images
-from kgs.datasets.image_file import read_image
 from kgs.datasets.images import Intrinsics, rectification, remap, resize
 
 WIDTH, HEIGHT = 120, 90
@@ -64,12 +64,6 @@ def test_a_truncated_image_is_named(tmp_path: Path, suffix: str, kept: float) ->
     path.write_bytes(path.read_bytes()[: int(kept * path.stat().st_size)])
     with pytest.raises(DataError, match=r"cut\."):
         read_image(path)
-
-
-def test_float_images_are_refused(tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "a.tif"), np.zeros((2, 2), np.float32))
-    with pytest.raises(DataError, match="8 or 16 bit"):
-        read_image(tmp_path / "a.tif")
 
 
 def test_folders(tmp_path: Path) -> None:
@@ -137,9 +131,9 @@ def test_no_distortion_changes_nothing() -> None:
 
 
 def test_distortion_that_folds_the_image_is_refused() -> None:
-    with pytest.raises(ValueError, match="folds"):
+    with pytest.raises(ValueError, match="distortion: .*fold"):
         undistort(blob(30.0, 30.0), lens(-3.0, 0.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match="folds"):
+    with pytest.raises(ValueError, match="distortion: .*fold"):
         undistort(blob(30.0, 30.0), lens(40.0, 0.0, 0.0, 0.0))
 
 

@@ -62,6 +62,6 @@ def test_model_points_need_the_same_poses(tmp_path: Path) -> None:
     np.testing.assert_allclose((scene.points.double() + scene.offset).numpy(), [WORLD_POINT], atol=1e-5)
     path = tmp_path / "sparse" / "0" / "images.txt"
     path.write_text(re.sub(r"\n96 \S+ (\S+)", r"\n96 0.5 \1", path.read_text()))
-    with pytest.raises(DataError, match="poses are not those"):
+    with pytest.raises(DataError, match="expected the poses of the scene"):
         load_scene(tmp_path, points="model-points")
     assert load_scene(tmp_path).init_kind == "none"

@@ -1,4 +1,4 @@
-"""Masks of photos: found, read, resized with the photo; what they leave out is ignored, or empty."""
+"""Masks of photos: read, resized with the photo; what they leave out is ignored, or empty."""
 
 import os
 from collections.abc import Callable
@@ -7,7 +7,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import PIL.Image
 import pytest
 import torch
 from init_point_scenes import painted_planes
@@ -15,7 +14,6 @@ from tiny_scenes import update_json, write_colmap, write_llff, write_nerfstudio
 
 from kgs._support.errors import DataError
 from kgs.datasets import load_scene
-from kgs.datasets.folders import list_images
 from kgs.datasets.mask_files import find_mask_files
 from kgs.datasets.scene import Views
 from kgs.fit.config import FitConfig
@@ -41,11 +39,6 @@ def in_the_file(root: Path) -> None:
     write_mask(root / "elsewhere" / "a.png")
 
 
-def beside_the_photo(root: Path) -> None:
-    write_nerfstudio(root)
-    write_mask(root / "images" / "dynamic_mask_0.png", 255 - LEFT)
-
-
 def in_folders_of_the_photos_names(root: Path) -> None:
     write_nerfstudio(root)
     for k in range(3):
@@ -58,18 +51,14 @@ def in_folders_of_the_photos_names(root: Path) -> None:
 def larger_and_coloured(root: Path) -> None:
     write_llff(root)
     mask = cv2.resize(LEFT, (64, 48), interpolation=cv2.INTER_NEAREST)
-    write_mask(root / "mask" / "0.jpg", np.repeat(mask[..., None], 3, 2))
+    write_mask(root / "masks" / "0.jpg", np.repeat(mask[..., None], 3, 2))
 
 
 @pytest.mark.parametrize(
     "write",
     [
         *("masks/0.png", "masks/0.PNG.png", "images/masks/0.png"),
-        *("Masks/0.png", "MASK/0.PNG.png", "masks/0_mask.png", "masks/0.mask.png", "masks/mask_0.jpg"),
-        *("masks/0.PNG_mask.png", "images/0_mask.png", "images/0-MASK.PNG", "images/0.mask.png"),
-        *("images/mask_0.png", "images/0.PNG.png", "images/Masks/0.png"),
         in_the_file,
-        beside_the_photo,
         in_folders_of_the_photos_names,
         larger_and_coloured,
     ],
@@ -94,82 +83,58 @@ def test_black_is_looked_away_from(tmp_path: Path, write: str | Callable[[Path],
 
 
 @pytest.mark.parametrize("name", ["0_mask.png", "0.png.png", "dynamic_mask_0.png"])
-def test_masks_among_photos_are_not_counted_as_photos(tmp_path: Path, name: str) -> None:
-    """A layout that takes all photos of a folder."""
+def test_what_looks_like_masks_among_photos_is_named_and_no_photo(tmp_path: Path, name: str) -> None:
+    """In a layout that takes all photos of a folder."""
     write_llff(tmp_path)
     write_mask(tmp_path / "images" / name)
     scene = load_scene(tmp_path, hold_out=0)
     assert len(scene.train) == 3
-    assert scene.train.valid_mask is not None
+    assert scene.train.valid_mask is None
+    (note,) = scene.notes
+    assert name in note
 
 
-@pytest.mark.parametrize(
-    ("photo", "other"),
-    [
-        *(("a.webp", "a.webp.jpg"), ("a.heic", "a.HEIC.jpg"), ("a.jpg", "a.jpg.jpg"), ("a.png", "a.png.jpg")),
-        *(("a.cr2", "a.CR2.png"), ("a.png", "a.png.png"), ("a.jpg", "a_mask.png"), ("a.jpg", "mask_a.jpg")),
-    ],
-)
-@pytest.mark.parametrize(
-    "kind", ["colours", "grey", "grey with noise", "grey in three channels", "palette", "black and white"]
-)
-def test_a_picture_beside_a_photo_is_a_mask_only_without_colours(
-    tmp_path: Path, photo: str, other: str, kind: str
-) -> None:
-    """Converters and makers of thumbnails add an ending, too: unless its name says mask, a mask ends in .png."""
-    (tmp_path / photo).write_bytes(b"any")
-    picture = PIL.Image.fromarray(LEFT)
-    if kind == "colours":
-        picture = PIL.Image.fromarray(np.dstack([LEFT, LEFT, 0 * LEFT]))
-    elif kind == "grey with noise":  # of a compression with loss
-        picture = PIL.Image.fromarray(np.dstack([LEFT, LEFT, LEFT // 2 * 2]))
-    elif kind != "grey":
-        mode = {"grey in three channels": "RGB", "palette": "P", "black and white": "1"}[kind]
-        picture = picture.convert(mode if other.endswith(".png") else "RGB")
-    picture.save(tmp_path / other)
-    is_named_so = "mask" in other or other.endswith(".png")
-    readable = {other, photo} - {"a.heic", "a.cr2"}
-    photos = {path.name for path in list_images(tmp_path)}
-    assert photos == (readable - {other} if is_named_so and kind != "colours" else readable)
-
-
-def test_a_photo_of_llff_may_be_called_like_another_one_with_an_ending(tmp_path: Path) -> None:
-    write_llff(tmp_path)
-    photos = sorted((tmp_path / "images").iterdir())
-    photos[1].rename(photos[0].with_name(f"{photos[0].name}.jpg"))
+def test_a_photo_that_a_scene_names_may_look_like_a_mask(tmp_path: Path) -> None:
+    write_nerfstudio(tmp_path)
+    (tmp_path / "images" / "1.png").rename(tmp_path / "images" / "0_mask.png")
+    update_json(tmp_path / "transforms.json", 1, file_path="images/0_mask.png")
     scene = load_scene(tmp_path, hold_out=0)
-    assert len(scene.train) == 3
+    assert "images/0_mask.png" in scene.train.names
     assert scene.train.valid_mask is None
 
 
-def test_photos_whose_names_only_look_like_masks_stay_photos(tmp_path: Path) -> None:
-    """As of a carnival mask; and a model may name what looks like a mask of another photo."""
+@pytest.mark.parametrize(("kind", "white"), [(np.uint8, 255), (np.uint8, 1), (np.uint16, 255), (np.uint16, 65535)])
+def test_white_is_the_largest_value_of_a_mask(tmp_path: Path, kind: type[np.uint8], white: int) -> None:
     write_llff(tmp_path)
-    for path in sorted((tmp_path / "images").iterdir()):
-        path.rename(path.with_name(f"mask_{path.name}"))
-    assert load_scene(tmp_path, hold_out=0).train.valid_mask is None
-    write_nerfstudio(tmp_path / "named")
-    (tmp_path / "named" / "images" / "1.png").rename(tmp_path / "named" / "images" / "0_mask.png")
-    update_json(tmp_path / "named" / "transforms.json", 1, file_path="images/0_mask.png")
-    assert load_scene(tmp_path / "named", hold_out=0).train.valid_mask is None
+    write_mask(tmp_path / "masks" / "0.png", (LEFT // 255).astype(kind) * kind(white))
+    write_mask(tmp_path / "masks" / "1.png", np.full((12, 16), np.iinfo(kind).max, kind))
+    valid = load_scene(tmp_path, hold_out=0).train.valid_mask
+    assert valid is not None
+    assert [float(kept.float().mean()) for kept in valid] == [0.5, 1, 1]
 
 
-def test_a_picture_beside_photos_that_is_called_like_a_mask_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("kind", "value"), [(np.uint8, 0), (np.uint8, 1), (np.uint16, 255)])
+def test_a_mask_of_one_value_is_refused_with_it(tmp_path: Path, kind: type[np.uint8], value: int) -> None:
+    write_llff(tmp_path)
+    path = write_mask(tmp_path / "masks" / "0.png", np.full((12, 16), value, kind))
+    with pytest.raises(DataError, match=rf"\b{value} everywhere") as error:
+        load_scene(tmp_path, hold_out=0)
+    assert error.value.path == path
+
+
+def test_masks_of_photos_that_are_gone_are_counted(tmp_path: Path) -> None:
+    """Of a model whose photo was deleted, and of one that it has not registered."""
     write_colmap(tmp_path)
-    write_mask(tmp_path / "images" / "0_seg.png")
-    (note,) = load_scene(tmp_path, hold_out=0).notes
-    assert "0_seg.png" in note
-
-
-@pytest.mark.parametrize("name", ["segmentation", "Person_Masks"])
-def test_a_folder_that_is_called_like_masks_is_named(tmp_path: Path, name: str) -> None:
-    write_llff(tmp_path)
-    write_mask(tmp_path / name / "0.png")
-    (note,) = load_scene(tmp_path, hold_out=0).notes
-    assert name in note
-    assert "--masks" in note
-    write_mask(tmp_path / "masks" / "0.png")
-    assert name not in " ".join(load_scene(tmp_path, hold_out=0).notes)
+    for name in ("0", "1", "2", "other"):
+        write_mask(tmp_path / "masks" / f"{name}.png")
+    (tmp_path / "images" / "1.png").unlink()
+    cv2.imwrite(str(tmp_path / "images" / "other.png"), LEFT)
+    scene = load_scene(tmp_path, hold_out=0)
+    assert scene.train.names == ("0.png", "2.png")
+    assert scene.train.valid_mask is not None
+    (note,) = (note for note in scene.notes if "fit no photo" in note)
+    assert "masks/1.png" in note
+    assert "masks/other.png" in note
 
 
 def test_black_is_not_there(tmp_path: Path) -> None:
@@ -213,28 +178,12 @@ def test_a_mask_is_reduced_with_its_photo(tmp_path: Path) -> None:
     assert [int((~view["valid_mask"]).sum()) for view in again] == [0, 1, 0]
 
 
-def test_masks_that_cannot_be_found(tmp_path: Path) -> None:
-    write_llff(tmp_path)
-    with pytest.raises(DataError, match="nowhere: "):
-        load_scene(tmp_path, masks=tmp_path / "nowhere")
-    with pytest.raises(ValueError, match="mask_mode"):
-        load_scene(tmp_path, mask_mode="gone")
-
-
 def test_photos_that_are_missing_are_named_beside_masks_too(tmp_path: Path) -> None:
     in_the_file(tmp_path)
     update_json(tmp_path / "transforms.json", 0, file_path="gone/0.png", mask_path="")
     write_mask(tmp_path / "masks" / "1.png")
-    with pytest.raises(DataError, match="images are missing"):
+    with pytest.raises(DataError, match="there is no"):
         load_scene(tmp_path, hold_out=0)
-
-
-def test_a_mask_of_a_photo_that_is_not_in_the_model_is_no_error(tmp_path: Path) -> None:
-    write_colmap(tmp_path)
-    cv2.imwrite(str(tmp_path / "images" / "not registered.png"), LEFT)
-    write_mask(tmp_path / "masks" / "not registered.png")
-    write_mask(tmp_path / "masks" / "0.png")
-    assert load_scene(tmp_path, hold_out=0).train.valid_mask is not None
 
 
 def test_the_folder_of_photos_is_listed_as_often_for_many_masks_as_for_few(
@@ -250,7 +199,7 @@ def test_the_folder_of_photos_is_listed_as_often_for_many_masks_as_for_few(
         scans: list[object] = []
         real = os.scandir
         monkeypatch.setattr(os, "scandir", lambda path, scans=scans, real=real: scans.append(path) or real(path))
-        assert len(find_mask_files([root / "images" / "0.png"], root).keeping) == 1
+        assert len(find_mask_files([root / "images" / "0.png"], root).masks) == 1
         monkeypatch.undo()
         seen.append(len(scans))
     assert seen[0] == seen[1] > 0
@@ -292,14 +241,6 @@ def test_only_pixels_that_count_are_measured(half: Views) -> None:
     assert "valid" not in whole
     renders = iter(torch.where(half.valid_mask[:, None], half.images + 0.01, 0.5).clamp(0, 1)[:, None])
     assert mean_psnr(lambda _: next(renders), half) == pytest.approx(shown["psnr"], abs=1e-3)
-
-
-def test_a_folder_of_masks_without_pictures_is_passed_over_unless_it_is_named(tmp_path: Path) -> None:
-    write_llff(tmp_path)
-    write_mask(tmp_path / "masks" / "of_another_kind.txt.d" / "0.png")
-    assert load_scene(tmp_path, hold_out=0).train.valid_mask is None
-    with pytest.raises(DataError, match="masks: "):
-        load_scene(tmp_path, hold_out=0, masks=tmp_path / "masks")
 
 
 def test_a_colour_that_a_mask_leaves_out_does_not_show_beside_it(tmp_path: Path) -> None:

@@ -43,9 +43,9 @@ def decoded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     sizes: list[int] = []
     real = image_file._decode
 
-    def decode(plugin: type[PIL.ImageFile.ImageFile], data: bytes) -> np.ndarray:
+    def decode(image: PIL.ImageFile.ImageFile, data: bytes, header: image_file.Metadata) -> np.ndarray:
         sizes.append(len(data))
-        return real(plugin, data)
+        return real(image, data, header)
 
     monkeypatch.setattr(image_file, "_decode", decode)
     return sizes
@@ -78,11 +78,11 @@ def test_unposed_photos(
     folder = write_photos(tmp_path / "photos", planes())
 
     def stop(*_: object) -> None:
-        raise DataError(folder, "", "stopped behind the decoding")
+        raise DataError(folder, "", "a stop behind the decoding")
 
     monkeypatch.setattr(accept, "write_matches", stop)
     opened.clear()
-    with pytest.raises(DataError, match="stopped"):
+    with pytest.raises(DataError, match="a stop"):
         pose_photos(folder, tmp_path / "out")
     jpegs = {Path(name).name: count for name, count in opened.items() if name.endswith(".jpg")}
     assert jpegs == {"IMG_1.jpg": 1, "IMG_2.jpg": 1, "IMG_3.jpg": 1}

@@ -32,7 +32,7 @@ def config(device):
 
 
 def fitted(scene, points, config, steps=None):
-    trainer = Trainer(scene, make_plan(scene, config), points)
+    trainer = Trainer(scene, make_plan(scene, config, points), points)
     trainer.fit(lambda trainer, _: trainer.step == steps)
     return trainer
 
@@ -76,7 +76,10 @@ def test_a_fit_learns_grows_and_repeats_bit_for_bit(device, scene, points, confi
     first, second = fitted(scene, points, config), fitted(scene, points, config)
     assert first.model.means.device.type == device.type
     assert len(first.model) > len(points.points)
-    assert first.state.curve[-1]["train_psnr"] > Trainer(scene, make_plan(scene, config), points).psnr(scene.train) + 1
+    assert (
+        first.state.curve[-1]["train_psnr"]
+        > Trainer(scene, make_plan(scene, config, points), points).psnr(scene.train) + 1
+    )
     assert_same_bits(first, second)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from kgs.fit.config import FitConfig, Recipe
+from kgs.fit.config import FitConfig, Recipe, Settings
 from kgs.fit.plan import make_schedule
 
 __all__ = ["PATIENCE", "Fit", "memory_of", "start_command"]
@@ -28,7 +28,7 @@ def _config(steps: int, points: Path, **changes: Any) -> FitConfig:
     """Densification, resets, harmonics and dropping all happen; a checkpoint is written every third step."""
     recipe = Recipe(grad_threshold=1e-5, prune_opacity=0.005, reset_interval=3000, reset_recovery=5)
     config = FitConfig(steps=steps, drop=0.3, evaluations=steps // 3, max_gaussians=1500, sh_degree=3, recipe=recipe)
-    schedule = make_schedule(config)
+    schedule = make_schedule(Settings.of(config, coarse=0.0, opacity_decay=1.0))
     if not (schedule.densify and schedule.reset and len(schedule.sh) == 3):
         raise RuntimeError(f"steps: expected room for all that a fit can do, got {steps}: {schedule}")
     return replace(config, init="file", init_file=points, **changes)
@@ -139,7 +139,7 @@ def _memory_of(points: Path, steps: int) -> tuple[float, int, int]:
     import torch
 
     from kgs.datasets import synthetic_scene
-    from kgs.fit.plan import gaussian_limit, make_plan
+    from kgs.fit.plan import make_plan
     from kgs.fit.run import choose_points
     from kgs.fit.trainer import Trainer
 
@@ -147,8 +147,8 @@ def _memory_of(points: Path, steps: int) -> tuple[float, int, int]:
     scene = synthetic_scene(train_views=3, test_views=1, size=SIZE, seed=0)
     config = replace(_config(steps, points, max_bytes=2**22), evaluations=1)
     points = choose_points(scene, config)
-    Trainer(scene, make_plan(scene, config), points).train_step()  # libraries and kernels are loaded
-    trainer = Trainer(scene, make_plan(scene, config), points)
+    Trainer(scene, make_plan(scene, config, points), points).train_step()  # libraries and kernels are loaded
+    trainer = Trainer(scene, make_plan(scene, config, points), points)
     before, resident = _resident(), []
 
     def note(trainer: Trainer, _: float) -> bool:
@@ -162,7 +162,7 @@ def _memory_of(points: Path, steps: int) -> tuple[float, int, int]:
     photos = scene.train.images
     images = 40 * photos[:1].nbytes + 4 * photos.nbytes  # those of the loss, and copies
     # and parameters, gradients, moments and copies of each Gaussian
-    ceiling = config.max_bytes + 4096 * gaussian_limit(config, len(points.points)) + images
+    ceiling = config.max_bytes + 4096 * trainer.plan.max_gaussians + images
     return slope / 1024, max(resident) - before, ceiling
 
 

@@ -64,7 +64,7 @@ def test_every_flipped_byte_and_every_cut_is_found(path):
 
 def test_safetensors_of_other_programs_are_refused(path):
     safetensors.torch.save_file({"x": torch.ones(3)}, path, {"format": "pt"})
-    with pytest.raises(DataError, match="expected the format '.*', got 'pt'"):
+    with pytest.raises(DataError, match="format: expected '.*', got 'pt'"):
         load_checkpoint(path)
 
 

@@ -9,11 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from refusals import refused
+from trainers import settled
 
-from kgs import RasterOptions
-from kgs.fit.config import PAPER, PRESETS, FitConfig, Recipe
-from kgs.fit.decisions import Decisions, DegreeDecision
-from kgs.fit.plan import expected_memory, gaussian_limit, make_plan, make_schedule, with_step_defaults
+from kgs import ArgumentError, RasterOptions
+from kgs.datasets import synthetic_scene
+from kgs.fit.config import PAPER, PRESETS, FitConfig, Recipe, Settings
+from kgs.fit.decisions import Decisions
+from kgs.fit.overlap import FEW, MANY
+from kgs.fit.plan import Plan, expected_memory, make_plan, make_schedule
 
 
 @pytest.mark.parametrize(
@@ -24,36 +28,27 @@ from kgs.fit.plan import expected_memory, gaussian_limit, make_plan, make_schedu
     ],
 )
 def test_a_short_fit_scales_the_counts_of_the_release(steps, sh, densify, reset):
-    schedule = make_schedule(replace(PAPER, steps=steps))
+    schedule = make_schedule(settled(PAPER, steps=steps))
     assert (schedule.sh, schedule.densify, schedule.reset) == (sh, tuple(densify), reset)
     assert schedule.evaluate[-1] == steps
 
 
 @pytest.mark.parametrize("steps", [1, 7, 100, 999])
 def test_densification_is_never_closer_than_ten_steps(steps):
-    densify = make_schedule(FitConfig(steps=steps)).densify
+    densify = make_schedule(settled(FitConfig(steps=steps))).densify
     assert all(later - step >= 10 for step, later in pairwise(densify))
 
 
 @pytest.mark.parametrize("steps", [500, 2000, 4000, 10_000, 30_000])
 def test_a_reset_leaves_time_to_recover(steps):
-    schedule = make_schedule(replace(PAPER, steps=steps))
+    schedule = make_schedule(settled(PAPER, steps=steps))
     assert all(end - step >= 200 for step, end in pairwise([*schedule.reset, steps]))
 
 
 def test_the_default_leaves_out_resets_and_harmonics():
-    schedule = make_schedule(PRESETS["auto"])
+    schedule = make_schedule(settled(PRESETS["auto"]))
     assert (schedule.sh, schedule.reset) == ((), ())
-    assert schedule.densify == make_schedule(replace(PAPER, steps=schedule.steps)).densify
-
-
-@pytest.mark.parametrize(("views", "steps"), [(1, 900), (3, 900), (4, None), (12, None)])
-def test_with_more_than_three_views_the_steps_stay_open_and_opacities_fade_more_slowly(views, steps):
-    config = with_step_defaults(FitConfig(), views)
-    assert (config.steps, config.recipe.opacity_decay) == (steps, 0.9925 if views <= 3 else 0.995)
-    assert with_step_defaults(FitConfig(steps=1001), views).recipe.opacity_decay == 0.995
-    given = FitConfig(steps=7, coarse=0.0, recipe=Recipe(opacity_decay=0.5))
-    assert with_step_defaults(given, views) == given
+    assert schedule.densify == make_schedule(settled(PAPER, steps=schedule.steps)).densify
 
 
 def test_plain_is_paper_without_dropping():
@@ -79,18 +74,18 @@ WRONG = {
 
 @pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in WRONG.items() for value in values])
 def test_values_out_of_range_or_of_another_kind_are_refused_by_name(name, value):
-    with pytest.raises(ValueError, match=rf"^{'init_file' if value == 'file' else name}: expected"):
+    with refused(ArgumentError, name="init_file" if value == "file" else name):
         FitConfig(**{name: value})
 
 
 @pytest.mark.parametrize("wrong", [{"lr_means": 0}, {"lr_sh_dc": -1}, {"reset_opacity": 1.0}, {"adam_eps": math.nan}])
 def test_the_recipe_is_held_to_its_ranges_too(wrong):
-    with pytest.raises(ValueError, match=rf"^{next(iter(wrong))}: expected"):
+    with refused(ArgumentError, name=next(iter(wrong))):
         Recipe(**wrong)
 
 
 def test_a_reset_may_not_remove_everything():
-    with pytest.raises(ValueError, match=r"^reset_opacity: expected a number above prune_opacity \(0.02\)"):
+    with refused(ArgumentError, name="reset_opacity"):
         Recipe(reset_interval=3000)
     assert Recipe(reset_interval=3000, prune_opacity=0.005).reset_opacity == 0.01
 
@@ -105,42 +100,64 @@ def test_numpys_numbers_and_paths_as_text_become_pythons():
 
 @pytest.mark.parametrize(("no_drop", "last"), [(0, 30), (1, 29), (3, 27), (50, 27)])  # a tenth of 30 steps is 3
 def test_nothing_is_dropped_in_the_last_steps_but_for_no_more_than_a_tenth(no_drop, last):
-    assert make_schedule(FitConfig(steps=30, no_drop_steps=no_drop)).drop == last
+    assert make_schedule(settled(FitConfig(steps=30, no_drop_steps=no_drop))).drop == last
 
 
 def test_the_coarse_share_is_counted_in_steps():
-    assert make_schedule(FitConfig(steps=2000)).coarse == 0
-    assert with_step_defaults(FitConfig(), 6).coarse == 0
-    assert make_schedule(FitConfig(steps=1000, coarse=0.5)).coarse == 500
+    assert make_schedule(settled(FitConfig(steps=2000))).coarse == 0
+    assert make_schedule(settled(FitConfig(steps=1000, coarse=0.5))).coarse == 500
 
 
 # -- the plan ------------------------------------------------------------------------------------------------------
 
 
-def test_a_plan_has_what_the_configuration_leaves_open_but_for_the_degree(scene):
-    plan = make_plan(scene, FitConfig(seed=3))
-    assert plan.config == with_step_defaults(FitConfig(seed=3), 3)
-    assert plan.config.sh_degree is None
+@pytest.mark.parametrize(
+    ("views", "config", "steps", "decay"),
+    [
+        (1, FitConfig(), FEW.steps, FEW.opacity_decay),
+        (3, FitConfig(), FEW.steps, FEW.opacity_decay),
+        (4, FitConfig(), MANY.steps, MANY.opacity_decay),
+        (3, FitConfig(steps=1001), 1001, MANY.opacity_decay),
+        (4, FitConfig(steps=7, recipe=Recipe(opacity_decay=0.5)), 7, 0.5),
+    ],
+)
+def test_a_plan_leaves_nothing_open(points, views, config, steps, decay):
+    scene = synthetic_scene(train_views=views, test_views=1, size=(16, 20))
+    plan = make_plan(scene, replace(config, seed=3), points)
+    expected = {"steps": steps, "drop": 0.3, "sh_degree": 0, "coarse": 0.0, "opacity_decay": decay}
+    assert plan.config == Settings.of(replace(config, seed=3), **expected)
     assert plan.schedule == make_schedule(plan.config)
-    assert (plan.device, plan.decisions) == (torch.device("cpu"), Decisions())
+    assert plan.max_gaussians == max(10 * steps, 225)
+    assert (plan.device, plan.decisions.overlap, plan.decisions.exposure) == (torch.device("cpu"), None, None)
+    assert plan.decisions.sh_degree.by == "rule"
     assert plan.backend in ("numba", "torch")
 
 
-def test_a_degree_changes_the_schedule_and_says_why(scene):
-    first = make_plan(scene, FitConfig(steps=100))
-    plan = first.decided({"sh_degree": 2}, sh_degree=DegreeDecision(2, "rule"))
-    assert (plan.config.sh_degree, len(plan.schedule.sh)) == (2, 2)
-    assert plan.decisions.to_dict() == {"sh_degree": {"chosen": 2, "by": "rule"}}
-    assert (first.config.sh_degree, first.schedule.sh, first.decisions) == (None, (), Decisions())
+def test_what_is_given_stays_as_it_is(scene, points):
+    given = settled(FitConfig(coarse=0.5, sh_degree=2, max_gaussians=400))
+    plan = make_plan(scene, given, points)
+    assert (plan.config, plan.max_gaussians, plan.decisions) == (given, 400, Decisions())
+
+
+@pytest.mark.parametrize("name", ["steps", "drop", "sh_degree", "coarse", "opacity_decay"])
+def test_settings_cannot_be_open(name):
+    numbers = {"steps": 9, "drop": 0.0, "sh_degree": 0, "coarse": 0.0, "opacity_decay": 1.0}
+    with pytest.raises(ValueError, match=f"^{name}: expected"):
+        Settings.of(FitConfig(), **numbers | {name: None})
+
+
+def test_a_plan_cannot_be_made_of_an_open_configuration(scene, points):
+    plan = make_plan(scene, FitConfig(), points)
+    with pytest.raises(TypeError, match="^config: expected Settings, got FitConfig"):
+        replace(plan, config=FitConfig())
+    with pytest.raises(TypeError, match="^config: "):
+        Plan(FitConfig(), plan.device, plan.backend, 100, plan.schedule, Decisions())
 
 
 def test_more_gaussians_or_pixels_take_more_memory(scene):
     smaller = replace(scene, train=scene.train.downsample(2))
     assert expected_memory(scene, 1000) < expected_memory(scene, 10**6)
     assert expected_memory(smaller, 1000) < expected_memory(scene, 1000)
-    assert gaussian_limit(FitConfig(max_gaussians=7), 100) == 7
-    assert gaussian_limit(FitConfig(steps=100), 100) == 1000
-    assert gaussian_limit(FitConfig(steps=100), 10_000) == 15_000
 
 
 def test_the_memory_of_a_render_is_bounded_as_without_a_fit():

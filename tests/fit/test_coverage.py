@@ -9,9 +9,7 @@ from kornia.metrics import psnr
 
 from kgs.datasets import synthetic_scene
 from kgs.fit.config import FitConfig
-from kgs.fit.plan import make_plan
-from kgs.fit.run import choose_points
-from kgs.fit.trainer import Trainer
+from kgs.fit.run import fit_scene
 from kgs.metrics.coverage import MIN_VIEWS, psnr_by_coverage, views_that_show
 
 HEIGHT, WIDTH, FOCAL, DEPTH = 10, 40, 20.0, 5.0
@@ -53,8 +51,8 @@ def test_what_is_hidden_from_a_view_or_has_no_depth_is_not_shown():
 @pytest.fixture(scope="module")
 def fit():
     scene = synthetic_scene(train_views=3, test_views=1, size=(48, 64))
-    config = FitConfig(steps=5, sh_degree=0, init="random", init_points=2000, evaluations=1)
-    return Trainer(scene, make_plan(scene, config), choose_points(scene, config)).fit()
+    config = FitConfig(steps=5, sh_degree=0, init="random", init_points=2000, evaluations=1, prune=False)
+    return fit_scene(scene, config)
 
 
 def test_both_parts_together_are_the_whole(fit):

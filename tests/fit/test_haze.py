@@ -5,15 +5,14 @@ from dataclasses import replace
 
 import pytest
 import torch
+from trainers import settled
 
 from kgs import GaussianModel
 from kgs.datasets import synthetic_scene
-from kgs.fit import Fit, FitConfig
+from kgs.fit import Fit, FitConfig, fit_scene
 from kgs.fit.config import PAPER, Recipe
 from kgs.fit.haze import FADE, WINDOW, darkest, veils
-from kgs.fit.plan import make_plan, make_schedule
-from kgs.fit.run import choose_points
-from kgs.fit.trainer import Trainer
+from kgs.fit.plan import make_schedule
 from kgs.geometry.types import RasterOptions
 
 
@@ -99,12 +98,12 @@ def test_a_fit_fades_veils_and_the_papers_recipe_does_not(monkeypatch):
         "kgs.densify.Densifier.decay_opacity", lambda self, factor, rows=None: faded.append((factor, rows is None))
     )
     config = FitConfig(steps=56, init="random", init_points=50, evaluations=1, recipe=Recipe(opacity_decay=1.0))
-    Trainer(scene, make_plan(scene, config), choose_points(scene, config)).fit()
+    fit_scene(scene, config)
     assert faded == [(FADE, False)]  # after 50 steps
-    assert make_schedule(PAPER).haze == ()
+    assert make_schedule(settled(PAPER)).haze == ()
 
 
 def test_looks_for_haze_end_before_the_fit():
-    assert make_schedule(FitConfig(steps=900)).haze == tuple(range(90, 811, 90))
-    assert make_schedule(FitConfig(steps=49)).haze == ()
-    assert make_schedule(FitConfig(steps=900, recipe=Recipe(haze_interval=0))).haze == ()
+    assert make_schedule(settled(FitConfig(steps=900))).haze == tuple(range(90, 811, 90))
+    assert make_schedule(settled(FitConfig(steps=49))).haze == ()
+    assert make_schedule(settled(FitConfig(steps=900, recipe=Recipe(haze_interval=0)))).haze == ()

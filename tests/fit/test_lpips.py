@@ -158,4 +158,4 @@ def test_broken_arrays_are_data_errors(files, value, said):
     change_arrays(files / HEADS_FILE, damage)
     with pytest.raises(DataError, match=f"expected {said}") as error:
         Lpips.load(files)
-    assert (error.value.path, error.value.field) == (files / HEADS_FILE, "lin2")
+    assert (error.value.path, error.value.key) == (files / HEADS_FILE, "lin2")

@@ -39,7 +39,7 @@ def test_the_initial_points_are_those_that_were_used(tiny, asked, recwarn):
 def test_points_of_somebody_else_are_not_taken_for_those_of_the_photos(tiny):
     draw = torch.Generator().manual_seed(0)
     points = InitialPoints(torch.rand(30, 3, generator=draw), torch.rand(30, 3, generator=draw), "lidar")
-    fit = Trainer(tiny, make_plan(tiny, CONFIG), points).fit()
+    fit = Trainer(tiny, make_plan(tiny, CONFIG, points), points).fit()
     assert measure(fit)["protocol"]["init"].startswith("lidar: initial points that were given; poses")
 
 

@@ -7,19 +7,18 @@ import pytest
 import torch
 
 from kgs.datasets import synthetic_scene
-from kgs.drop import DropGaussian
 from kgs.fit.config import DROP, FitConfig
-from kgs.fit.decisions import Decisions
 from kgs.fit.overlap import (
+    FEW,
     FEW_TOGETHER,
+    MANY,
     MANY_TOGETHER,
     MAX_STEPS,
     Overlap,
-    decide_by_overlap,
     drop_rate_for,
     steps_for,
 )
-from kgs.fit.plan import FEW, MANY, make_plan
+from kgs.fit.plan import make_plan
 from kgs.fit.pruning import left_out
 from kgs.fit.run import fit_scene
 from kgs.fit.trainer import Trainer
@@ -66,14 +65,13 @@ def test_photos_that_show_two_patches_are_counted_over_all_pairs():
 
 @pytest.mark.parametrize("photos", [3.0, 5.0, 8.0])
 def test_what_is_open_is_decided_by_the_patches(scene, photos):
-    plan = decide_by_overlap(make_plan(scene, OPEN), points_seen_by(photos))
+    plan = make_plan(scene, OPEN, points_seen_by(photos))
     together = Overlap.of(points_seen_by(photos).patches).views_per_pair
     chosen = {"steps": steps_for(photos), "drop": drop_rate_for(together)}
-    assert plan.config == replace(make_plan(scene, OPEN).config, **chosen)
+    assert {name: getattr(plan.config, name) for name in chosen} == chosen
     assert plan.schedule.steps == chosen["steps"]
     numbers = {"views_per_patch": pytest.approx(photos), "views_per_pair": pytest.approx(together, abs=0.01)}
-    found = {"overlap": {**numbers, "patches": 1000, **chosen}}
-    assert json.loads(json.dumps(plan.decisions.to_dict())) == found
+    assert json.loads(json.dumps(plan.decisions.to_dict()))["overlap"] == {**numbers, "patches": 1000, **chosen}
     assert ("DropGaussian is off" in left_out(plan.decisions)) == (chosen["drop"] == 0)
     assert (Trainer(scene, plan, points_seen_by(photos)).state.drop is None) == (chosen["drop"] == 0)
 
@@ -82,23 +80,15 @@ def test_what_is_open_is_decided_by_the_patches(scene, photos):
     "points", [points_seen_by(8.0, count=MIN_PATCHES - 1), replace(points_seen_by(8.0), patches=None)]
 )
 def test_without_patches_gaussians_are_dropped_in_a_fit_of_the_usual_length(scene, points):
-    plan = decide_by_overlap(make_plan(scene, OPEN), points)
-    assert (plan.config.drop, plan.config.steps, plan.decisions) == (DROP, MANY.steps, Decisions())
+    plan = make_plan(scene, OPEN, points)
+    assert (plan.config.drop, plan.config.steps, plan.decisions.overlap) == (DROP, MANY.steps, None)
 
 
 @pytest.mark.parametrize("given", [{"drop": 0.0}, {"drop": 0.2}, {"steps": 7}, {"steps": 7, "drop": 0.2}])
 def test_what_is_given_is_not_decided(scene, given):
-    plan = decide_by_overlap(make_plan(scene, replace(OPEN, **given)), points_seen_by(8.0))
+    plan = make_plan(scene, replace(OPEN, **given), points_seen_by(8.0))
     assert {name: getattr(plan.config, name) for name in given} == given
     assert not given.keys() & plan.decisions.to_dict().get("overlap", {}).keys()
-
-
-def test_a_trainer_whose_plan_is_open_drops_in_a_fit_of_the_usual_length(scene, tmp_path):
-    trainer = Trainer(scene, make_plan(scene, OPEN), points_seen_by(3.0))
-    assert isinstance(trainer.state.drop, DropGaussian)
-    assert (trainer.state.drop.p, trainer.plan.schedule.steps) == (DROP, MANY.steps)
-    trainer.save(tmp_path / "c.safetensors")
-    assert Trainer.resume(scene, OPEN, tmp_path / "c.safetensors").plan.schedule.steps == MANY.steps
 
 
 def test_a_whole_fit_says_what_it_decided():

@@ -52,7 +52,7 @@ def test_dropping_gains_over_seeds():
         levels = []
         for drop in (0.0, PAPER.drop):
             config = replace(PAPER, steps=1200, drop=drop, seed=seed, max_gaussians=3000, recipe=recipe)
-            trainer = Trainer(scene, make_plan(scene, config), points)
+            trainer = Trainer(scene, make_plan(scene, config, points), points)
             trainer.fit()
             levels.append(evaluate(trainer.render, scene.test)["psnr"])
         gains.append(levels[1] - levels[0])

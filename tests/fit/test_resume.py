@@ -12,7 +12,7 @@ from kgs import DataError
 from kgs.fit import FitConfig, InitialPoints, Trainer
 from kgs.fit.checkpoint import load_checkpoint, save_checkpoint
 from kgs.fit.config import Recipe
-from kgs.fit.decisions import DegreeDecision, ExposureDecision, OverlapDecision
+from kgs.fit.decisions import Decisions, DegreeDecision, ExposureDecision, OverlapDecision
 from kgs.fit.plan import make_plan
 
 CONFIG = FitConfig(steps=6, drop=0.3, seed=5, evaluations=1, sh_degree=2, recipe=Recipe(grad_threshold=1e-5))
@@ -62,7 +62,8 @@ def test_a_stopped_and_resumed_fit_has_the_bits_of_one_that_was_not_stopped(
     scene, points, tmp_path, step, settings, entries, decisions
 ):
     config = replace(LONG, **settings)
-    plan = make_plan(scene, config).decided(entries, **decisions)
+    plan = make_plan(scene, replace(config, **entries), points)
+    plan = replace(plan, decisions=Decisions(**decisions))
     whole, stopped = Trainer(scene, plan, points), Trainer(scene, plan, points)
     whole.fit()
     stopped.fit(stop_at(step))
@@ -197,7 +198,7 @@ def test_a_mistake_in_kgs_or_of_the_caller_is_no_fault_of_the_checkpoint(scene, 
         return fail
 
     for function, error in (
-        ("kgs.fit.trainer.make_plan", TypeError("unsupported operand")),
+        ("kgs.fit.trainer.Plan.of", TypeError("unsupported operand")),
         ("kgs.fit.state.TrainState._assemble", TypeError("unsupported operand")),
         ("kgs.fit.trainer.targets", TypeError("unsupported operand")),
         ("kgs.fit.state.GaussianModel", torch.OutOfMemoryError("out of memory")),

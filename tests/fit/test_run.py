@@ -4,6 +4,7 @@ import os
 import shutil
 import signal
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -12,11 +13,10 @@ from kgs._support.errors import DataError
 from kgs.app import fit_folder as app
 from kgs.app.files.publishing import UNFINISHED
 from kgs.app.files.results_folder import CHECKPOINT
-from kgs.app.fit_folder import train
 from kgs.app.scene_request import SceneRequest
+from kgs.app.training import Training
 from kgs.fit.checkpoint import load_checkpoint, previous
 from kgs.fit.config import FitConfig, Recipe
-from kgs.fit.plan import make_plan
 from kgs.fit.trainer import Trainer
 
 CONFIG = FitConfig(steps=12, evaluations=4, max_gaussians=300, recipe=Recipe(grad_threshold=1e-5))
@@ -25,7 +25,7 @@ CONFIG = FitConfig(steps=12, evaluations=4, max_gaussians=300, recipe=Recipe(gra
 @pytest.fixture(scope="module", autouse=True)
 def _few_points(points):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(app, "choose_points", lambda *_: points)
+        patch.setattr("kgs.fit.run.choose_points", lambda *_: points)
         yield
 
 
@@ -43,9 +43,11 @@ def whole(scene, tmp_path_factory):
     return out
 
 
-@pytest.fixture
-def trainer(scene):
-    return Trainer(scene, make_plan(scene, CONFIG), app.choose_points(scene, CONFIG))
+def train(scene, path, disturb=lambda _: None):
+    """A training whose trainer is disturbed as it begins."""
+    training = Training(path, begun=disturb)
+    training.fit(scene, CONFIG)
+    return training
 
 
 def at_step(trainer, step, act):
@@ -62,22 +64,22 @@ def at_step(trainer, step, act):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_ends_the_step_and_saves(trainer, tmp_path, number):
+def test_a_signal_ends_the_step_and_saves(scene, tmp_path, number):
     handler = signal.getsignal(number)
-    at_step(trainer, 9, lambda: os.kill(os.getpid(), number))
-    assert train(trainer, tmp_path / CHECKPOINT)[1] == number
-    assert load_checkpoint(tmp_path / CHECKPOINT)["step"] == trainer.step == 9
+    disturb = partial(at_step, step=9, act=lambda: os.kill(os.getpid(), number))
+    training = train(scene, tmp_path / CHECKPOINT, disturb)
+    assert training.signal == number
+    assert load_checkpoint(tmp_path / CHECKPOINT)["step"] == training.trainer.step == 9
     assert signal.getsignal(number) == handler
 
 
-def test_a_second_signal_acts_at_once(trainer, tmp_path):
+def test_a_second_signal_acts_at_once(scene, tmp_path):
     def twice():
         os.kill(os.getpid(), signal.SIGINT)
         os.kill(os.getpid(), signal.SIGINT)
 
-    at_step(trainer, 9, twice)
     with pytest.raises(KeyboardInterrupt):
-        train(trainer, tmp_path / CHECKPOINT)
+        train(scene, tmp_path / CHECKPOINT, partial(at_step, step=9, act=twice))
     assert signal.getsignal(signal.SIGINT) == signal.default_int_handler
 
 
@@ -98,19 +100,20 @@ def test_an_interrupted_fit_writes_its_results_and_goes_on(scene, whole, tmp_pat
 
 
 @pytest.mark.parametrize("steps", [(3, 9), range(1, 12)])  # by the evaluations, and by the clock
-def test_a_full_disk_is_one_note_and_the_next_checkpoint_is_tried(trainer, tmp_path, monkeypatch, steps):
+def test_a_full_disk_is_one_note_and_the_next_checkpoint_is_tried(scene, tmp_path, monkeypatch, steps):
     plain, failed = os.fsync, []
+    training = Training(tmp_path / CHECKPOINT)
     if len(steps) > 2:
-        monkeypatch.setattr(app, "_SAVE_SECONDS", 0.0)
+        monkeypatch.setattr("kgs.app.training._SAVE_SECONDS", 0.0)
 
     def full(descriptor):
-        if trainer.step in steps:
-            failed.append(trainer.step)
+        if training.trainer.step in steps:
+            failed.append(training.trainer.step)
             raise OSError(28, "No space left on device")
         plain(descriptor)
 
     monkeypatch.setattr("os.fsync", full)
-    assert train(trainer, tmp_path / CHECKPOINT)[1] == 0
+    trainer, _ = training.fit(scene, CONFIG)
     assert failed == [*steps]
     (note,) = trainer.state.notes
     assert note.startswith(f"step {steps[0]}: no checkpoint: ")
@@ -126,7 +129,7 @@ def test_a_damaged_checkpoint_falls_back_and_ends_in_the_same_bits(scene, whole,
     shutil.copytree(whole, tmp_path, dirs_exist_ok=True)
     path = tmp_path / CHECKPOINT
     path.write_bytes(path.read_bytes()[:-7])
-    with pytest.raises(DataError, match=f"holds {CHECKPOINT}, which .* was changed since: move it away"):
+    with pytest.raises(DataError, match=f"was changed since, got {CHECKPOINT}: move it away"):
         fit_folder(scene, CONFIG, tmp_path, resume=True)
     (tmp_path / UNFINISHED).mkdir()
     for part in (path, previous(path)):
@@ -162,11 +165,11 @@ def test_stages_memory_and_what_is_not_resumed_are_told(scene, tmp_path):
     assert load_checkpoint(previous(tmp_path / CHECKPOINT))["config"]["seed"] == 1  # nothing of the former fit
 
 
-def test_a_signal_that_is_ignored_stays_so(trainer, tmp_path):
+def test_a_signal_that_is_ignored_stays_so(scene, tmp_path):
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
     try:
-        at_step(trainer, 3, lambda: os.kill(os.getpid(), signal.SIGHUP))
-        assert train(trainer, tmp_path / CHECKPOINT)[1] == 0
+        disturb = partial(at_step, step=3, act=lambda: os.kill(os.getpid(), signal.SIGHUP))
+        training = train(scene, tmp_path / CHECKPOINT, disturb)
     finally:
         signal.signal(signal.SIGHUP, before)
-    assert trainer.step == 12
+    assert (training.signal, training.trainer.step) == (0, 12)

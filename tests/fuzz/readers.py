@@ -22,6 +22,7 @@ from damage import (
 )
 from tiny_scenes import (
     narrow_lpips,
+    read_image,
     write_blender,
     write_colmap,
     write_config,
@@ -33,11 +34,10 @@ from tiny_scenes import (
 )
 from torch import Tensor
 
-from kgs.app.saved_fit import read_settings
+from kgs.app.saved_fit import read_request
 from kgs.datasets import Scene, Views, load_scene, synthetic_scene
-from kgs.datasets.image_file import read_image
 from kgs.fit.config import FitConfig
-from kgs.fit.plan import make_plan, make_schedule
+from kgs.fit.plan import make_plan
 from kgs.fit.trainer import Trainer
 from kgs.init_points import InitialPoints
 from kgs.init_points.files import read_points
@@ -124,7 +124,7 @@ def _scene() -> Scene:
 def _write_checkpoint(folder: Path) -> None:
     points = torch.rand(_POINTS, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor([0.0, 0.0, 4.0])
     first = InitialPoints(points, torch.full((_POINTS, 3), 0.5), "random")
-    trainer = Trainer(_scene(), make_plan(_scene(), _CONFIG), first)
+    trainer = Trainer(_scene(), make_plan(_scene(), _CONFIG, first), first)
     trainer.fit(lambda trainer, _: trainer.step == 2)
     trainer.save(folder / "checkpoint.safetensors")
 
@@ -139,9 +139,7 @@ def _read_checkpoint(folder: Path) -> None:
 
 
 def _read_config(folder: Path) -> None:
-    _, config = read_settings(folder / "config.json")
-    make_schedule(config)
-    json.dumps(config.to_dict(), allow_nan=False)
+    json.dumps(read_request(folder / "config.json").to_dict(), allow_nan=False)
 
 
 def _read_lpips(folder: Path) -> None:

@@ -14,11 +14,10 @@ import numpy as np
 import pytest
 from cost import read_within_bounds
 from damage import GEOMETRIC_KEYS
-from tiny_scenes import plain_png, update_json, write_blender, write_image, write_nerfstudio
+from tiny_scenes import plain_png, read_image, update_json, write_blender, write_image, write_nerfstudio
 
 from kgs._support.errors import DataError
 from kgs.datasets import Views, load_scene
-from kgs.datasets.image_file import read_image
 from kgs.init_points.files import read_points
 
 SIDE = 8000

@@ -41,7 +41,9 @@ def few(points):
 
 
 def trainer(scene, points, backend, **options):
-    return Trainer(scene, make_plan(scene, FitConfig(steps=50, sh_degree=1, backend=backend, **options)), points)
+    return Trainer(
+        scene, make_plan(scene, FitConfig(steps=50, sh_degree=1, backend=backend, **options), points), points
+    )
 
 
 @pytest.mark.slow

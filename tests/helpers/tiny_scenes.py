@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from kgs._support.json_files import write_json
+from kgs.datasets.image_file import Image, ImageFile
 from kgs.fit.config import FitConfig
 from kgs.metrics import lpips
 from kgs.metrics.lpips import Lpips
@@ -143,6 +144,11 @@ def write_nerfstudio(root: Path) -> None:
     fisheye = {"camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k2": -0.01, "k3": 0.003, "k4": 0.001}
     frames: dict[str, Object] = {"images/0.png": {}, "images/1.png": fisheye, "images/2.png": {}}
     write_transforms(root / "transforms.json", {**lens, "k1": -0.05, "k2": 0.01, "p1": 0.001}, frames)
+
+
+def read_image(path: Path) -> Image:
+    """The pixels of an image in a file that is opened for this alone."""
+    return ImageFile(path).read()
 
 
 def write_image(folder: Path, suffix: str, channels: int = 3) -> None:

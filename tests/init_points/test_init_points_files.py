@@ -114,7 +114,7 @@ def test_a_text_is_bounded_before_it_is_read(tmp_path, monkeypatch):
         write("comment.ply", text.replace("element", "comment format binary\nelement"), count),
         write("cloud.xyz", "0 0 0\n" * 2000, count),
     ):
-        with pytest.raises(DataError, match=rf"{path.name}: is larger than 64 MiB, the most for a text file"):
+        with pytest.raises(DataError, match=rf"{path.name}: expected at most 64 MiB in a text file"):
             initial_points(flat(), "file", file=path)
     monkeypatch.setattr(files, "_MAX_TEXT_BYTES", 2**16)
     count = 2**16 // 12 + 1

@@ -24,7 +24,7 @@ INVENTORY = {
     "kgs.losses": "TargetMoments photometric_loss target_moments",
     "kgs.datasets": "Scene Views load_scene synthetic_scene",
     "kgs.fit": """
-        Fit FitConfig InitialPoints Plan Trainer choose_points decide fit_scene initial_points make_plan measure prune
+        Fit FitConfig Hooks InitialPoints Plan Trainer choose_points fit_scene initial_points make_plan measure prune
     """,
     "kgs.reference": "Layers layers render",
 }
@@ -85,7 +85,7 @@ SIGNATURES = {
     "kgs.load_ply": "path",
     "kgs.losses.photometric_loss": "image, target, dssim_weight=0.2",
     "kgs.datasets.load_scene": "path, train_views=None, downscale=None",
-    "kgs.fit.make_plan": "scene, config",
+    "kgs.fit.make_plan": "scene, config, points",
     "kgs.fit.Trainer": "scene, plan, points",
     "kgs.fit.Trainer.fit": "self, callback=None",
     "kgs.fit.Trainer.resume": "scene, config, path",

@@ -188,9 +188,8 @@ def test_a_value_that_holds_tensors_is_equal_to_itself_alone():
 
 # -- errors --------------------------------------------------------------------------------------------------------
 
-# two import nothing of kgs; the readers turn their ValueErrors into DataErrors
-PLAIN = {"kgs.drop", "kgs.reference"}
-PLAIN |= {"kgs._support.json_files", "kgs.datasets.color_profile", "kgs.datasets.image_file", "kgs.fit.checkpoint"}
+PLAIN = {"kgs.drop", "kgs.reference"}  # import nothing of kgs
+PLAIN |= {"kgs._support.json_files", "kgs.datasets.image_file"}  # whose readers turn them into DataErrors
 
 
 def test_a_wrong_value_is_an_argument_error():

@@ -45,7 +45,7 @@ def rasterized() -> object:
 
 
 def trained(scene: Scene, points: kgs.fit.InitialPoints) -> object:
-    trainer = Trainer(scene, make_plan(scene, FitConfig(steps=2, drop=0.3)), points)
+    trainer = Trainer(scene, make_plan(scene, FitConfig(steps=2, drop=0.3), points), points)
     for _ in range(2):
         trainer.train_step()
     return trainer.model.state_dict()

@@ -59,6 +59,7 @@ WRONG = [
     ("model", TypeError, lambda: kgs.save_ply("x.ply", MODEL())),
     ("model", TypeError, lambda: save_glb("x.glb", MODEL(), UPRIGHT)),
     ("model", TypeError, lambda: Densifier(MODEL(), None, 1.0)),
+    ("projected", TypeError, lambda: Densifier(MODEL, torch.optim.Adam(MODEL.parameters()), 1.0).observe(MODEL())),
     ("index", TypeError, lambda: MODEL()[0]),
     ("backgrounds", TypeError, lambda: rasterize(backgrounds=[[1, 1, 1]])),
     ("background", TypeError, lambda: reference.render(MODEL(), scene().train.camera(0), [0.0, 0.0, 0.0])),
@@ -67,12 +68,13 @@ WRONG = [
     ("images", TypeError, lambda: views(scene().train.images.numpy())),
     ("extrinsics", TypeError, lambda: camera_extent(scene().train.cameras)),
     ("views", TypeError, lambda: initial_points(scene())),
-    ("scene", TypeError, lambda: Trainer(scene().train, make_plan(scene(), CONFIG), points())),
+    ("scene", TypeError, lambda: Trainer(scene().train, make_plan(scene(), CONFIG, points()), points())),
     ("plan", TypeError, lambda: Trainer(scene(), CONFIG, points())),
     ("scene", TypeError, lambda: fit_scene(scene().train, CONFIG)),
-    ("scene", TypeError, lambda: make_plan(scene().train, CONFIG)),
-    ("config", TypeError, lambda: make_plan(scene(), {})),
-    ("points", TypeError, lambda: Trainer(scene(), make_plan(scene(), CONFIG), points().points)),
+    ("scene", TypeError, lambda: make_plan(scene().train, CONFIG, points())),
+    ("config", TypeError, lambda: make_plan(scene(), {}, points())),
+    ("points", TypeError, lambda: make_plan(scene(), CONFIG, points().points)),
+    ("points", TypeError, lambda: Trainer(scene(), make_plan(scene(), CONFIG, points()), points().points)),
     ("names", ValueError, lambda: views(scene().train.images, ("a", "a"))),
     ("sh_degree", ValueError, lambda: rasterize(colors=torch.rand(4, 4, 3), sh_degree=1.0)),
     ("radial_coeffs", ValueError, lambda: rasterize(radial_coeffs=np.zeros((1, 4)))),
@@ -100,7 +102,7 @@ def test_numbers_of_numpy_are_taken(tmp_path):
 
 
 def test_paths_may_be_text(tmp_path):
-    trainer = Trainer(scene(), make_plan(scene(), CONFIG), points())
+    trainer = Trainer(scene(), make_plan(scene(), CONFIG, points()), points())
     trainer.train_step()
     trainer.save(str(tmp_path / "c.safetensors"))
     assert Trainer.resume(scene(), CONFIG, str(tmp_path / "c.safetensors")).step == 1
@@ -120,5 +122,5 @@ def test_a_package_that_results_need_is_missed_before_the_training(monkeypatch, 
 
 def test_points_of_the_right_kind_are_taken():
     mine = InitialPoints(points().points, points().colors, "mine")
-    init = Trainer(scene(), make_plan(scene(), CONFIG), mine).state.start.init
+    init = Trainer(scene(), make_plan(scene(), CONFIG, mine), mine).state.start.init
     assert init == {"kind": "mine", "points": len(mine.points)}

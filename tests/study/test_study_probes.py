@@ -80,7 +80,7 @@ def test_it_is_repeatable_and_says_when_nothing_is_covered():
 def test_counts_by_distance():
     scene = synthetic_scene(train_views=2, test_views=0, size=(24, 32))
     points = initial_points(scene.train, "random", count=600)
-    plan = make_plan(scene, FitConfig(steps=4, max_gaussians=600))
+    plan = make_plan(scene, FitConfig(steps=4, max_gaussians=600), points)
     trainer = Trainer(scene, plan, points)
     trainer.fit()
     counts = count_over_threshold(trainer, points.points)

@@ -23,7 +23,7 @@ def train(trainer, steps):
 
 
 def test_distances_are_those_to_the_cameras_centre(scene, points):
-    trainer = Trainer(scene, make_plan(scene, CONFIG), points)
+    trainer = Trainer(scene, make_plan(scene, CONFIG, points), points)
     for view in range(3):
         camera = scene.train.camera(view)
         rotation, shift = camera.extrinsics[0, :3, :3], camera.extrinsics[0, :3, 3]
@@ -35,7 +35,7 @@ def test_distances_are_those_to_the_cameras_centre(scene, points):
 
 def test_gradients_are_means_of_what_the_densifier_observed(scene, points):
     config = replace(CONFIG, recipe=Recipe(grad_threshold=1e9))
-    trainer = train(Trainer(scene, make_plan(scene, config), points), 9)  # before the first densification
+    trainer = train(Trainer(scene, make_plan(scene, config, points), points), 9)  # before the first densification
     state = trainer.state.densifier.state_dict()
     expected = state["gradient_sums"] / (1 + state["counts"])
     assert float(expected.max()) > 0
@@ -46,7 +46,7 @@ def test_gradients_are_means_of_what_the_densifier_observed(scene, points):
 
 @pytest.mark.parametrize("by", ["high-gradient", "low-gradient", "near", "far"])
 def test_the_trainer_sets_the_scores_of_the_present_camera(scene, points, by):
-    trainer = RivalTrainer(scene, make_plan(scene, CONFIG), points, Rival(drop_by=by))
+    trainer = RivalTrainer(scene, make_plan(scene, CONFIG, points), points, Rival(drop_by=by))
     seen, cameras = [], []
 
     def check(module, inputs, output):
@@ -67,7 +67,7 @@ def test_the_trainer_sets_the_scores_of_the_present_camera(scene, points, by):
 
 
 def test_a_rival_that_is_none_is_the_fit_itself(scene, points):
-    plan = make_plan(scene, CONFIG)
+    plan = make_plan(scene, CONFIG, points)
     plain = train(Trainer(scene, plan, points), 12)
     rival = train(RivalTrainer(scene, plan, points, Rival()), 12)
     for one, other in zip(plain.model.parameters(), rival.model.parameters(), strict=True):
@@ -77,7 +77,7 @@ def test_a_rival_that_is_none_is_the_fit_itself(scene, points):
 @pytest.mark.parametrize("by", ["gradient", "distance"])
 def test_the_penalty_lowers_opacities_the_more_the_higher_the_score(scene, points, by):
     config = replace(CONFIG, drop=0.0, recipe=Recipe(grad_threshold=1e9, prune_opacity=0.0))
-    plan = make_plan(scene, config)
+    plan = make_plan(scene, config, points)
     without = train(Trainer(scene, plan, points), 15)
     penalised = train(RivalTrainer(scene, plan, points, Rival(opacity_l1=1.0, opacity_l1_by=by)), 15)
     fall = (without.model.opacity_logits.sigmoid() - penalised.model.opacity_logits.sigmoid()).detach()

@@ -70,7 +70,7 @@ def set_cell(cell: Cell) -> dict[str, Any]:
         try:
             report = pose_photos(folder, Path(temporary) / "out", say=lambda line: None)
         except DataError as error:
-            return {"given": given, "rotations": {}, "why": error.reason.splitlines()[0]}
+            return {"given": given, "rotations": {}, "why": error.advice.partition("\n")[0]}
         views = load_scene(Path(temporary) / "out", hold_out=0).train
     turns = {name: cv2.Rodrigues(pose[:3, :3].numpy())[0].ravel() for name, pose in _poses(views)}
     return {

@@ -55,10 +55,12 @@ def fit_step() -> Callable[[], Any]:
     from kgs.init_points import InitialPoints
 
     scene = synthetic_scene(train_views=2, test_views=1, size=SIZE, seed=1)
-    plan = make_plan(scene, FitConfig(steps=30_000, sh_degree=3, backend="triton"))
-    schedule = plan.schedule._replace(sh=(0, 0, 0), densify=(), reset=(), haze=(), evaluate=())
+    config = FitConfig(steps=30_000, sh_degree=3, backend="triton")
     points = torch.rand(GAUSSIANS, 3, generator=torch.Generator().manual_seed(0))
-    fit = Trainer(scene, replace(plan, schedule=schedule), InitialPoints(points, points, "random"))
+    first = InitialPoints(points, points, "random")
+    plan = make_plan(scene, config, first)
+    schedule = plan.schedule._replace(sh=(0, 0, 0), densify=(), reset=(), haze=(), evaluate=())
+    fit = Trainer(scene, replace(plan, schedule=schedule), first)
     fit._look_every = 10**9  # as in 19 of 20 steps on a GPU
     fit._loss = 0.0
     return fit.train_step

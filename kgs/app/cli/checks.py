@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from kgs._support.errors import ArgumentError, DataError
+from kgs._support.errors import ArgumentError, DataError, quoted
 from kgs.datasets.folders import has_photos
 from kgs.datasets.options import held_out_between_ends
 from kgs.datasets.source import SceneSource
@@ -13,13 +13,13 @@ SMALLEST = 32  # pixels of the longer side of a fit's photos
 def check_roll(roll: float) -> None:
     """Raise a ValueError unless this is an angle by which pictures can be turned."""
     if not -360 <= roll <= 360:
-        raise ArgumentError(f"roll: expected degrees in [-360, 360], got {roll}")
+        raise ArgumentError("roll", "degrees in [-360, 360]", roll)
 
 
 def check_side(size: int) -> None:
     """Raise a ValueError unless photos can be fitted with so many pixels on their longer side."""
     if size < SMALLEST:
-        raise ArgumentError(f"size: expected at least {SMALLEST} pixels, got {size}")
+        raise ArgumentError("size", f"at least {SMALLEST} pixels", size)
 
 
 def check_file(out: Path, ending: str, kind: str, source: Path | None = None) -> None:
@@ -30,21 +30,20 @@ def check_file(out: Path, ending: str, kind: str, source: Path | None = None) ->
     from kgs.app.files.publishing import check_free
 
     if out.suffix.lower() != ending:
-        raise ArgumentError(f"out: expected a file that ends in {ending}, got {str(out)!r}")
+        raise ArgumentError("out", f"a file that ends in {ending}", quoted(out))
     if out.is_dir():
-        raise DataError(out, "", "expected a file, found a folder of this name")
+        raise DataError(out, "", "a file", "a folder of this name")
     if source is not None and out.exists() and out.samefile(source):
-        raise ArgumentError(f"out: expected another file than {str(source)!r}, which is read")
+        raise ArgumentError("out", f"another file than {str(source)!r}, which is read")
     if not out.absolute().parent.is_dir():
-        raise DataError(out, "", "no such folder to write it to")
+        raise DataError(out, "", "a folder to write it to", "none")
     check_free(out.parent, kind, [out.name])
 
 
 def check_photos_of(source: SceneSource) -> None:
     """Raise a DataError unless a scene has at least one photo."""
     if not has_photos(source.root):
-        reason = "has camera poses but no photos: expected them in images/, or where its files say"
-        raise DataError(source.root, "", reason)
+        raise DataError(source.root, "", "photos in images/, or where its files say", "camera poses alone")
 
 
 def check_results(out: Path) -> None:
@@ -58,9 +57,9 @@ def check_results(out: Path) -> None:
     config = out / "config.json"
     if not config.exists() and has_fit(out / UNFINISHED):
         with locked(out):  # or it is at work
-            raise DataError(out, "", "holds a fit that is not done: kgs fit --resume goes on with it")
+            raise DataError(out, "", "a fit that is done", "one that is not", advice="kgs fit --resume goes on with it")
     if not config.exists():
-        raise DataError(config, "", "cannot be read: expected the folder of the results of kgs fit")
+        raise DataError(config, "", "this file in the folder of the results of kgs fit", "none")
     read_json(config)
 
 
@@ -98,16 +97,16 @@ def check_photos(
     if size is None and downscale is None:
         return
 
-    from kgs.datasets.image_file import read_size
+    from kgs.datasets.image_file import ImageFile
 
-    width, height = min(read_size(path) for path in paths)
+    width, height = min(ImageFile(path).size for path in paths)
     name = "size" if downscale is None else "downscale"
     factor = max(1.0, max(width, height) / size) if size is not None else downscale or 1.0
     reduced = [max(1, round(side / factor)) for side in (width, height)]
     for side, minimum, pixels in (("longer", SMALLEST, max(reduced)), ("shorter", shortest, min(reduced))):
         if pixels < minimum:
             got = f"{reduced[0]}x{reduced[1]} of {width}x{height}"
-            raise ArgumentError(f"{name}: expected {minimum} pixels or more of the {side} side, got {got}")
+            raise ArgumentError(name, f"{minimum} pixels or more of the {side} side", got)
 
 
 def _check_views(views: int | None, hold_out: int | None, count: int, what: str) -> None:
@@ -115,4 +114,4 @@ def _check_views(views: int | None, hold_out: int | None, count: int, what: str)
     maximum = count - len(held_out_between_ends(count - 2, hold_out)) if hold_out else count
     if views is not None and views > maximum:
         rest = f" of which {count - maximum} are held out" if hold_out else ""
-        raise ArgumentError(f"views: expected at most {maximum} of {count} {what}{rest}, got {views}")
+        raise ArgumentError("views", f"at most {maximum} of {count} {what}{rest}", views)

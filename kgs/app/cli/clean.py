@@ -65,10 +65,10 @@ def clean(
     if splat.is_dir():
         for name, value in (("cameras", cameras), ("downscale", downscale)):
             if value is not None:
-                raise ArgumentError(f"{name}: expected a PLY file as SPLAT, got a folder, which has its own scene")
+                raise ArgumentError(name, "a PLY file as SPLAT", "a folder, which has its own scene")
         check_results(splat)
     elif cameras is None and downscale is not None:
-        raise ArgumentError("downscale: expected --cameras with it, got none")
+        raise ArgumentError("downscale", "--cameras with it", "none")
     torch_device = load_tools(device, backend)
 
     from kgs.app.files.publishing import replacing
@@ -124,7 +124,7 @@ def clean(
 def _check_some(splat: Path, model: "GaussianModel") -> None:
     """Refuse a splat without Gaussians."""
     if not len(model):
-        raise DataError(splat, "Gaussians", "expected at least one, got none")
+        raise DataError(splat, "Gaussians", "at least one", "none")
 
 
 def _load_alone(ply: Path) -> tuple["GaussianModel", "Tensor"]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from kgs._support.errors import printable, quantity
-from kgs.app.console import VIEWER, as_line, each, open_in_browser, say, say_next, say_on_terminal
+from kgs.app.console import VIEWER, as_line, open_in_browser, say, say_next, say_on_terminal
 from kgs.datasets.folders import LAYOUT_FILES
 from kgs.fit.config import DEMO, DEMO_STEPS, ROOM_DEMO, Backend, FitConfig
 
@@ -141,20 +141,17 @@ def _compare(fit: "Fit", config: FitConfig | None, request: "SceneRequest", out:
     from kgs.app.files.figures import write_curve, write_sheet
     from kgs.app.files.locks import locked
     from kgs.app.files.publishing import replacing
-    from kgs.app.fit_folder import train
     from kgs.app.page.fit_page import PAGE, write_fit_page
+    from kgs.app.training import Training
     from kgs.fit.measures import measure
-    from kgs.fit.plan import make_plan
-    from kgs.fit.run import choose_points
-    from kgs.fit.trainer import Trainer
 
     scene = fit.scene
     fits = {"with DropGaussian": fit}
     if config is not None:
-        points = choose_points(scene, config, each)
-        plain, signal = train(Trainer(scene, make_plan(scene, replace(config, drop=0.0)), points), None, title="fit")
-        if signal:
-            raise SystemExit(128 + signal)
+        training = Training()
+        _, plain = training.fit(scene, replace(config, drop=0.0))
+        if training.signal:
+            raise SystemExit(128 + training.signal)
         fits = {"without DropGaussian": plain.annotated(metrics=measure(plain)), **fits}
         _say_difference(fits)
     renders = {title: [image[0] for image in one.test_renders.images] for title, one in fits.items()}

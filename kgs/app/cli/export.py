@@ -43,7 +43,7 @@ def export(
 
     model = load_ply(ply, torch.tensor(origin, dtype=torch.float64))
     if not len(model):
-        raise DataError(ply, "vertex", "expected at least one Gaussian, got none")
+        raise DataError(ply, "vertex", "at least one Gaussian", "none")
     with replacing(out.parent, "export") as new:
         save_compressed_ply(new / out.name, model)
     sizes = [path.stat().st_size / 1e6 for path in (out, ply)]

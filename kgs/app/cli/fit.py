@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 import tyro
 
-from kgs._support.errors import ArgumentError, DataError, printable, quantity
+from kgs._support.errors import ArgumentError, DataError, printable, quantity, quoted
 from kgs.app.console import VIEWER, as_line, open_in_browser, say, say_next, say_on_terminal
 from kgs.fit.config import COARSE, DETAILS, PRESETS, Background, FitConfig, min_side
 
@@ -90,8 +90,8 @@ def fit(
         background: the colour behind photos with transparency.
         frames: how many frames are taken from a video. Unless given: twelve, fewer where the camera moves little, more
             where it moves far.
-        masks: folder of masks, white where a photo is kept. Unless given: masks/ beside the photos, or
-            IMG_1_mask.png beside IMG_1.jpg.
+        masks: folder of masks, white where a photo is kept: IMG_1.png or IMG_1.jpg.png of IMG_1.jpg. Unless given:
+            masks/.
         mask_mode: what black in a mask means. ignore: these pixels do not count. transparent: empty space.
         preset: auto: what the training views need. paper: DropGaussian's rule and recipe, as published. plain: the same
             without dropping. See --preset paper --help-all.
@@ -119,13 +119,13 @@ def fit(
     as_photos = source is None or is_posed_by_kgs(source)
     if measure and (not as_photos or hold_out or views is not None):
         reason = "photos without camera poses, and neither --hold-out nor --views: these hold photos out themselves"
-        raise ArgumentError(f"measure: expected {reason}")
+        raise ArgumentError("measure", reason)
     if as_photos and hold_out is None:
         hold_out = 0
     check_roll(roll)
     _check_size(size, downscale, unposed)
     if views is not None and views < 1:
-        raise ArgumentError(f"views: expected a whole number of at least 1, got {views}")
+        raise ArgumentError("views", "a whole number of at least 1", views)
     check_options(downscale, hold_out)
     check_frames(frames, scene)
     if lpips_weights is not None:
@@ -142,7 +142,7 @@ def fit(
         check_photos_of(source)
     if config.init == "scene" and (source is None or source.layout != "Blender"):
         kind = "photos without camera poses" if source is None else f"the layout {source.layout}"
-        raise ArgumentError(f"init: expected another one for {kind}, got 'scene', Blender's points")
+        raise ArgumentError("init", f"another one for {kind}", "'scene', Blender's points")
     if resume and config.device == "auto" and begun_on_cpu(out):
         config = replace(config, device="cpu")  # on a GPU it would go on with other bits
     device = load_tools(config.device, config.backend, "safetensors", "jinja2")
@@ -191,7 +191,9 @@ def fit(
         assert not isinstance(size, str)  # refused before
         request, source = find_scene(scene, out, request, config.seed, size, frames)
     elif (out / CAMERAS_REPORT).exists():
-        raise DataError(out, "", "holds cameras that kgs found for other photos: choose another folder")
+        raise DataError(
+            out, "", "a folder without cameras", "those that kgs found for other photos", advice="choose another folder"
+        )
     elif size == "field":
         photo_folder, factor, why = field_size(source)
         say(why)
@@ -204,10 +206,10 @@ def fit(
     loaded = request.load(out, say, source)
     height, width = loaded.train.images.shape[-2:]
     if max(height, width) < SMALLEST:
-        reason = f"expected at least {SMALLEST} pixels, got photos of {width}x{height}"
+        fault = (f"at least {SMALLEST} pixels", f"photos of {width}x{height}")
         if downscale is None:  # a size that is too small is refused before
-            raise DataError(scene, "images", reason)
-        raise ArgumentError(f"downscale: {reason}")
+            raise DataError(scene, "images", *fault)
+        raise ArgumentError("downscale", *fault)
     kept = f"{quantity(len(loaded.train), 'training photo')} of {width}x{height}"
     say(f"{printable(scene)}: {kept}, {len(loaded.test) or 'none'} held out")
     with on_ctrl_c("the cameras that were found are kept" if unposed else ""):
@@ -273,10 +275,10 @@ def short_help(config: FitConfig) -> type[Any]:
 def _check_size(size: int | str | None, downscale: float | None, unposed: bool) -> None:
     """Raise a ValueError unless the photos can have this size."""
     if size is not None and downscale is not None:
-        raise ArgumentError("size: expected either a size or a downscale factor, got both")
+        raise ArgumentError("size", "either a size or a downscale factor", "both")
     if isinstance(size, str) and re.fullmatch(r"field|images(_\d+)?", size) is None:
-        raise ArgumentError(f"size: expected pixels, field or a folder as images_8, got {size!r}")
+        raise ArgumentError("size", "pixels, field or a folder as images_8", quoted(size))
     if isinstance(size, str) and unposed:
-        raise ArgumentError(f"size: expected pixels for photos without camera poses, got {size!r}")
+        raise ArgumentError("size", "pixels for photos without camera poses", quoted(size))
     if isinstance(size, int):
         check_side(size)

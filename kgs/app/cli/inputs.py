@@ -31,11 +31,11 @@ def options_of_fit(ply: Path, source: SceneSource) -> dict[str, Any]:
 
     Empty if the splat does not lie in the folder of a fit to this scene, and the scene is not such a folder.
     """
-    from kgs.app.saved_fit import read_settings
+    from kgs.app.saved_fit import read_request
 
     for folder in (ply.parent, source.root):
         with suppress(DataError):  # there is no fit, or this is a file of another program
-            request, _ = read_settings(folder / "config.json")
+            request = read_request(folder / "config.json")
             if (folder / request.scene).resolve() == source.root.resolve():
                 masks = folder / request.masks if request.masks else None
                 names = ("downscale", "photo_folder", "mask_mode")
@@ -55,7 +55,7 @@ def load_splat(ply: Path, scene: "Scene", device: "torch.device", backend: str) 
 
     model = load_ply(ply, origin=scene.offset)
     if not len(model):
-        raise DataError(ply, "Gaussians", "expected at least one, got none")
+        raise DataError(ply, "Gaussians", "at least one", "none")
     near_plane = Recipe().near_plane * typical_depths(model.means, scene.train.cameras)[0]
     options = RasterOptions(near_plane=near_plane, antialiased=model.antialiased)
     fit = Fit(scene, model.to(device), options, backend)
@@ -79,7 +79,8 @@ def _check_seen(ply: Path, fit: "Fit") -> None:
         if not len(project(gaussians, camera, options=fit.options, colors=False, backend=fit.backend)):
             blind.append(name)
     if len(blind) == len(views):
-        reason = f"expected some that a camera of {printable(fit.scene.root)} sees, got none of {len(fit.model)}"
-        raise DataError(ply, "Gaussians", f"{reason}: are they in the frame of these cameras?")
+        expected = f"some that a camera of {fit.scene.root} sees"
+        advice = "are they in the frame of these cameras?"
+        raise DataError(ply, "Gaussians", expected, f"none of {len(fit.model)}", advice=advice)
     if blind:
         say(f"these cameras see no Gaussian of {printable(ply)}: {listed(blind)}")

@@ -21,7 +21,7 @@ EMPTY = Path()  # what "" on a command line becomes: this object. An equal one i
 def _read_input(words: list[str]) -> Path:
     path = _read_output(words)
     if path is not EMPTY and not path.exists():
-        raise DataError(path, "", "no such file or folder")
+        raise DataError(path, "", "a file or folder", "none")
     return path
 
 

@@ -59,7 +59,7 @@ def page(
     check_roll(roll)
     check_options(downscale, None)
     if size is not None and downscale is not None:
-        raise ArgumentError("size: expected either a size or a downscale factor, got both")
+        raise ArgumentError("size", "either a size or a downscale factor", "both")
     if size is not None:
         check_side(size)
     check_file(out, ".html", "page")
@@ -84,7 +84,7 @@ def page(
     height, width = scene.train.images.shape[-2:]
     if min(height, width) < WINDOW:
         name = "downscale" if size is None else "size"
-        raise ArgumentError(f"{name}: expected photos of at least {WINDOW} pixels a side, got {width}x{height}")
+        raise ArgumentError(name, f"photos of at least {WINDOW} pixels a side", f"{width}x{height}")
     fit = load_splat(ply, scene, torch_device, backend)
     few = spread(len(scene.train), MAX_PICTURES)
     photographed = load_scene(source, len(few), hold_out=0, **options)

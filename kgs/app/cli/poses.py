@@ -31,20 +31,22 @@ def poses(
         out: folder for the scene: images, sparse/0 (a COLMAP model) and photos.json (how the cameras were found).
         frames: how many frames are taken from a video. Unless given: twelve, fewer where the camera moves little, more
             where it moves far.
-        masks: folder of masks, white where a photo is kept. Unless given: masks/ beside the photos, or
-            IMG_1_mask.png beside IMG_1.jpg.
+        masks: folder of masks, white where a photo is kept: IMG_1.png or IMG_1.jpg.png for IMG_1.jpg. Unless given:
+            masks/ beside the photos.
         seed: of the solvers.
     """
     from kgs.app.files.publishing import UNFINISHED
     from kgs.app.files.results_folder import has_fit
 
     if open_scene(photos) is not None:
-        raise DataError(photos, "", "has camera poses: kgs fit takes it as it is")
+        raise DataError(photos, "", "photos without camera poses", "a scene", advice="kgs fit takes it as it is")
     check_frames(frames, photos)
     check_installed("pycolmap")
     check_photos(photos, out, frames=frames)
     if has_fit(out) or has_fit(out / UNFINISHED):
-        raise DataError(out, "", "holds a fit, to which its cameras belong: choose another folder")
+        raise DataError(
+            out, "", "a folder without a fit", "one, to which its cameras belong", advice="choose another folder"
+        )
     load_tools()
 
     from kgs.app.sfm import pose_photos

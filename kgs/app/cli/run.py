@@ -58,6 +58,7 @@ _USER_ERRORS = {
     errno.ENOTDIR,
     errno.EROFS,
 }
+_NO_MEMORY = re.compile("DefaultCPUAllocator: (can't allocate|not enough) memory")
 _HELP_ALL = {"--help-all", "--help_all"}
 _HELP = {"-h", "--help", "help"}
 
@@ -100,10 +101,10 @@ def _explain(error: Exception, flags: dict[str, str]) -> tuple[int, str]:
     match error:
         case DataError():
             code = REFUSED_PHOTOS if isinstance(error, PhotosRefused) else WRONG_FILE
-            return code, str(DataError(error.path, flags.get(error.field, error.field), error.reason))
+            return code, str(error)
         case ArgumentError():
-            argument, colon, reason = str(error).partition(":")
-            return WRONG_WORDS, printable(flags.get(argument, argument) + colon + reason)
+            name = flags.get(error.name, error.name)
+            return WRONG_WORDS, str(ArgumentError(name, error.expected, error.got, advice=error.advice))
         case ImportError() if explanation := explain_import_error(error):
             return FAILED, explanation
         case TrainingDiverged():
@@ -112,15 +113,18 @@ def _explain(error: Exception, flags: dict[str, str]) -> tuple[int, str]:
             code = WRONG_FILE if error.errno in _USER_ERRORS else FAILED
             prefix = f"{printable(error.filename)}: " if error.filename else ""
             return code, prefix + (error.strerror or printable(error))
-        case MemoryError() | RuntimeError() if _is_of_memory(error):
+        case _ if _is_of_memory(error):
             return FAILED, f"not enough memory: {error}".partition("\n")[0]
     say("".join(traceback.format_exception(error)).rstrip(), sys.stderr)
     return BUG, "this is a mistake in kgs: please report it, with the lines above and those of kgs check"
 
 
 def _is_of_memory(error: Exception) -> bool:
-    """Whether memory ran out: torch and CUDA say so in a RuntimeError."""
-    return isinstance(error, MemoryError) or any(word in str(error) for word in ("allocate", "of memory"))
+    """Whether memory ran out, as Python, a GPU or torch's allocator of the CPU says it."""
+    torch = sys.modules.get("torch")
+    of_gpu = torch is not None and isinstance(error, torch.OutOfMemoryError)
+    of_cpu = isinstance(error, RuntimeError) and _NO_MEMORY.search(str(error)) is not None
+    return isinstance(error, MemoryError) or of_gpu or of_cpu
 
 
 def _find(words: list[str]) -> tuple[str, list[str]]:
@@ -203,7 +207,7 @@ def _check_out(command: Callable[..., Any], name: str, words: list[str]) -> None
     if is_given or not is_needed or "--" in words or not words or words[0].startswith("-"):
         return
     if not words[0]:
-        raise ArgumentError(f"{next(iter(inspect.signature(command).parameters))}: expected a path, got ''")
+        raise ArgumentError(next(iter(inspect.signature(command).parameters)), "a path", "''")
     folder = f"{Path(words[0]).resolve().stem}-{name.rpartition(' ')[2]}"
     whole = as_line("kgs", *name.split(), *words, "-o", folder)
     raise SystemExit(f"-o: expected a folder for the results, for example {whole}")
@@ -227,7 +231,7 @@ def _parse(command: Callable[..., Any], name: str, words: list[str]) -> partial[
         config = bound.get("config")
         for option, value in [*bound.items(), ("init_file", config and config.init_file)]:
             if value is EMPTY:
-                raise ArgumentError(f"{option}: expected a path, got ''")
+                raise ArgumentError(option, "a path", "''")
         return partial(command, *arguments, **options)
 
     function: Callable[..., partial[Any]] = bind

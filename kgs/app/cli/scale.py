@@ -3,7 +3,7 @@
 import math
 from pathlib import Path
 
-from kgs._support.errors import ArgumentError, printable
+from kgs._support.errors import ArgumentError, printable, quoted
 from kgs.app.console import as_line, say, say_next
 
 from .checks import check_file, check_results
@@ -28,10 +28,10 @@ def scale(splat: Path, /, *, by: tuple[str, str, float], out: Out) -> None:
     """
     a, b, length = by
     if not (math.isfinite(length) and length > 0):
-        raise ArgumentError(f"by: expected a length above 0, got {length:g}")
+        raise ArgumentError("by", "a length above 0", f"{length:g}")
     distance = math.dist(_point(a), _point(b))
     if not (0 < distance < math.inf and 0 < length / distance < math.inf):
-        raise ArgumentError(f"by: expected two points that can be {length:g} apart, got {a} and {b}")
+        raise ArgumentError("by", f"two points that can be {length:g} apart", f"{a} and {b}")
     factor = length / distance
     if splat.is_dir():
         _scale_folder(splat, out, factor, length)
@@ -93,5 +93,5 @@ def _point(text: str) -> list[float]:
     except ValueError:
         values = []
     if len(values) != 3 or not all(map(math.isfinite, values)):
-        raise ArgumentError(f"by: expected a point as 1.5,-2,0.25, got {text!r}")
+        raise ArgumentError("by", "a point as 1.5,-2,0.25", quoted(text))
     return values

@@ -6,9 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kgs._support.errors import ArgumentError, DataError
+from kgs._support.errors import ArgumentError
 from kgs.app.console import each, say
-from kgs.datasets.folders import CAMERAS_REPORT, VIDEO_SUFFIXES, layout_of, scene_nearby, why_no_scene
+from kgs.datasets.folders import CAMERAS_REPORT, VIDEO_SUFFIXES, layout_of, no_scene, scene_nearby
 from kgs.datasets.source import SceneSource
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ def open_scene(path: Path) -> SceneSource | None:
     is_video = path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
     if is_video or (path.is_dir() and scene_nearby(path) is None):
         return None
-    raise DataError(path, "", why_no_scene(path))
+    raise no_scene(path)
 
 
 def find_scene(
@@ -85,9 +85,9 @@ def check_frames(frames: int | None, photos: Path) -> None:
     from kgs.app.sfm.find import MIN_PHOTOS, find_video
 
     if frames is not None and frames < MIN_PHOTOS:
-        raise ArgumentError(f"frames: expected at least {MIN_PHOTOS}, got {frames}")
+        raise ArgumentError("frames", f"at least {MIN_PHOTOS}", frames)
     if frames is not None and find_video(photos) is None:
-        raise ArgumentError("frames: expected a video to take them from, got photos")
+        raise ArgumentError("frames", "a video to take them from", "photos")
 
 
 def notes_on_photos(photos: Path, masks: Path | None) -> list[str]:

@@ -60,11 +60,11 @@ def save_glb(
     """
     check_kind("model", model, GaussianModel)
     if tuple(rotation.shape) != (3, 3) or not bool(rotation.isfinite().all()):
-        raise ArgumentError(f"rotation: expected finite numbers of shape (3, 3), got {rotation.tolist()}")
+        raise ArgumentError("rotation", "finite numbers of shape (3, 3)", rotation.tolist())
     attributes = _attributes(model)
     for name, values in attributes.items():
         if not np.isfinite(values).all():
-            raise ArgumentError(f"model: expected values that are finite in float32, got NaN or infinity in {name}")
+            raise ArgumentError("model", "values that are finite in float32", f"NaN or infinity in {name}")
     matrix = rotation.double().cpu()
     quaternion = rotation_matrix_to_quaternion(matrix)[[1, 2, 3, 0]]  # from w, x, y, z to x, y, z, w
     translation = torch.zeros(3, dtype=torch.float64, device="cpu")

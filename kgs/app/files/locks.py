@@ -43,5 +43,11 @@ def locked(out: Path) -> Iterator[None]:
     """
     with held(out / ".lock") as ours:
         if not ours:
-            raise DataError(out, "", "kgs is at work on the fit in this folder: wait for it or choose another folder")
+            raise DataError(
+                out,
+                "",
+                "no kgs at work on the fit in this folder",
+                "one",
+                advice="wait for it or choose another folder",
+            )
         yield

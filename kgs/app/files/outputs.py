@@ -34,15 +34,15 @@ def check_folder(out: Path, scene: Path | None = None, make: bool = True) -> Non
     """
     there = next(path for path in (out, *out.absolute().parents) if os.path.lexists(path))
     if not there.is_dir():
-        raise DataError(out, "", f"expected a folder for results, but {there} is none")
+        raise DataError(out, "", "a folder for results", f"{there}, which is none")
     if not os.access(there, os.W_OK | os.X_OK):
-        raise DataError(out, "", f"results cannot be written there: no permission for {there}")
+        raise DataError(out, "", "a folder that can be written to", f"no permission for {there}")
     inside = scene is not None and out.resolve().is_relative_to(scene.resolve())
     has_photos = inside and there == out and not is_own(out, *(path.name for path in list_images(out)))
     # kgs wrote these: the cameras that a former run found, or those of the demo
     of_photos = ("sparse", LAYOUT_FILES["nerfstudio"]) if (out / CAMERAS_REPORT).exists() else ()
     if has_photos or any((out / name).exists() for name in _SCENES if name not in of_photos):
-        raise DataError(out, "", "holds photos or files of a scene: choose another folder for the results")
+        raise DataError(out, "", "a folder for results", "photos or files of a scene", advice="choose another folder")
     if make:
         out.mkdir(parents=True, exist_ok=True)
 
@@ -75,5 +75,5 @@ def write_png(path: Path, image: "Tensor") -> None:
 
     ok, content = cv2.imencode(".png", eight_bits(image))
     if not ok:
-        raise DataError(path, "", f"expected an image that can be encoded, got shape {tuple(image.shape)}")
+        raise DataError(path, "", "an image that can be encoded", f"shape {tuple(image.shape)}")
     write_whole(path, content.tobytes())

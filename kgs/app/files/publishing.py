@@ -142,7 +142,8 @@ def _read(folder: Path) -> dict[str, Any]:
         content = read_json(path)
         if _is_marker(content.get("files")) and not path.is_symlink():
             return content
-    raise DataError(path, "", "is no marker of this version of kgs: remove it, or choose another folder for results")
+    advice = "remove it, or choose another folder for results"
+    raise DataError(path, "", "a marker of this version of kgs", "another file", advice=advice)
 
 
 def _is_marker(kinds: Any) -> bool:
@@ -213,8 +214,8 @@ def _check_free(out: Path, own: dict[str, list[str | None]], advice: str = "or c
     blocked = [path for name, shas in own.items() if (path := _in_the_way(out, name, shas)) is not None]
     if blocked:
         names = listed([path.relative_to(out).as_posix() for path in dict.fromkeys(blocked)], _MAX_NAMED)
-        reason = f"holds {names}, which this command did not write, or which was changed since"
-        raise DataError(out, "", f"{reason}: move it away, {advice}")
+        expected = "nothing that this command did not write, or that was changed since"
+        raise DataError(out, "", expected, names, advice=f"move it away, {advice}")
 
 
 def _in_the_way(folder: Path, name: str, own: Iterable[str | None]) -> Path | None:

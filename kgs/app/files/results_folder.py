@@ -33,7 +33,8 @@ def check_fit_files(out: Path, resume: bool, others: Iterable[str] = ()) -> None
 def check_no_fit(work: Path) -> None:
     """Raise a DataError if a folder has a fit that is not done."""
     if has_fit(work):
-        raise DataError(work, "", "holds a fit that is not done: go on with it by --resume, or remove this folder")
+        advice = "go on with it by --resume, or remove this folder"
+        raise DataError(work, "", "a fit that is done", "one that is not", advice=advice)
 
 
 def has_fit(folder: Path) -> bool:

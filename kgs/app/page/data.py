@@ -125,7 +125,7 @@ def pack(
     while len(packed.content) > max_bytes:
         count = min(count - 1, math.floor(_TARGET_SHARE * count * max_bytes / len(packed.content)))
         if count < 1:
-            raise ArgumentError(f"max_bytes: expected room for a Gaussian, got {max_bytes} bytes")
+            raise ArgumentError("max_bytes", "room for a Gaussian", f"{max_bytes} bytes")
         chosen = {name: value[order[:count]] for name, value in values.items()}
         packed = _gzip(_compressed_columns(chosen, cameras, near_plane, COARSE, 0), 0)
     words += [*reductions, f"{count} of {len(rows)} Gaussians"]

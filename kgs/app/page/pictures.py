@@ -119,5 +119,5 @@ def _data_uri(image: Tensor, side: int, quality: int = _JPEG_QUALITY) -> str:
         array = np.asarray(cv2.resize(array, size, interpolation=cv2.INTER_AREA), np.uint8)
     done, content = cv2.imencode(".jpg", array, [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
-        raise ArgumentError(f"image: expected one that can be encoded as JPEG, got {width}x{height} pixels")
+        raise ArgumentError("image", "one that can be encoded as JPEG", f"{width}x{height} pixels")
     return "data:image/jpeg;base64," + base64.b64encode(content.tobytes()).decode()

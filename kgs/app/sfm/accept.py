@@ -23,19 +23,19 @@ from kgs._support.progress import ProgressBar
 from kgs.geometry.rigs import degrees_between
 
 from .find import MIN_PHOTOS
-from .map import Cameras, Solver, quiet_pycolmap
-from .match import colmap_matching, exif_focals, write_matches
+from .map import Cameras, Solver
+from .match import colmap_matching, lenses_of, write_matches
 from .pairs import (
     FEWER,
     MIN_MATCHES,
     Pairs,
     gap,
-    missing_link,
     pair_geometry,
     table,
     verified_matches,
     weakest_link,
     went_forward,
+    what_would_help,
     why_no_cameras,
     without_overlap,
 )
@@ -55,7 +55,7 @@ _UNTOLD = "the photos do not tell the focal length, and their Exif does not say 
 _FORWARD = (
     "The camera moved along its view, as when walking forward: what lies ahead hardly moves between such photos, and "
     "nothing tells how far away it is. What helps most: step sideways, not forward, so that neighbours are 3 to 20 "
-    f"degrees apart. {FEWER}"
+    f"degrees apart.\n{FEWER}"
 )
 _APART = (
     "As a rule they are too close together. What helps: larger steps to the side or up, so that neighbours are 3 to 20 "
@@ -105,11 +105,12 @@ def accepted_cameras(
     """
     folder = photos[0].path.parent
     size = photos[0].size
+    lenses = lenses_of(photos)
     first, second = (Solver(work / f"{name}.db", images, work / name, seed) for name in ("first", "second"))
-    with quiet_pycolmap(), ThreadPoolExecutor(1) as executor, PycolmapProcesses() as processes:
-        matching = colmap_matching(photos, images, masks, work, list(names))
+    with ThreadPoolExecutor(1) as executor, PycolmapProcesses() as processes:
+        matching = colmap_matching(photos, lenses, images, masks, work, list(names))
         second_matches = executor.submit(processes.run, "write_colmap_matches", second.database, seed=seed, **matching)
-        write_matches(first.database, photos, list(names), bar)
+        write_matches(first.database, photos, list(names), lenses, bar)
         processes.run("verify", first.database, seed=seed)
         matches = {(names[a], names[b]): found for (a, b), found in verified_matches(first.database).items()}
         pairs = {pair: len(found) for pair, (found, _) in matches.items()}
@@ -119,9 +120,9 @@ def accepted_cameras(
         geometries = {pair: geometry for pair, geometry in geometries.items() if rejected.keys().isdisjoint(pair)}
         kept = {image: name for image, name in names.items() if name not in rejected}
         if reason := why_no_cameras(list(kept.values()), pairs, geometries):
-            raise PhotosRefused(folder, "", reason)
-        focals = [focal for focal in exif_focals(photos) if focal]
-        known = focals if len(focals) == len(exif_focals(photos)) else []
+            raise PhotosRefused(folder, "", "photos whose cameras can be found", advice=reason)
+        are_known = all(lens.has_prior_focal_length for lens in lenses)
+        known = [lens.focal_length for lens in lenses] if are_known else []
         consensus = Consensus((first, second), second_matches, executor, known, pairs)
         solutions, held = consensus.solve(kept)
         while more := without_cameras(solutions, list(kept.values()), pairs):
@@ -280,7 +281,7 @@ def _registered_badly(first: Cameras, second: Cameras, names: Sequence[str], pai
     registered = [name for name in names if name in first.points and name in second.points]
     better = max((first, second), key=lambda found: _worst_seen(found, registered))
     for name in names:
-        advice = missing_link(name, [other for other in names if other != name], pairs)
+        advice = what_would_help(name, [other for other in names if other != name], pairs)
         if name not in registered:
             who = "only one" if name in first.points or name in second.points else "neither"
             left[name] = f"{who} of two solvers could place it{advice}"
@@ -344,8 +345,8 @@ def check(
     """
 
     def refuse(reason: str, advice: str) -> NoReturn:
-        said = f"no cameras that can be trusted: {reason}. {_FORWARD if forward else advice}"
-        raise PhotosRefused(folder, "", f"{said}.\n{table(names, pairs)}")
+        said = f"{reason}.\n{_FORWARD if forward else advice}.\n{table(names, pairs)}"
+        raise PhotosRefused(folder, "", "photos whose cameras can be trusted", advice=said)
 
     missing = [name for name in names if any(name not in cameras.points for cameras in solutions)]
     registered = [name for name in names if name not in missing]
@@ -353,7 +354,7 @@ def check(
     beside = (
         f"What helps most: photos from places between {' and '.join(between)}, with steps to the side or up (turning "
         "on the spot shows no depth), so that neighbours share two thirds of the scene; a scene with texture; all with "
-        f"one lens, without zoom. {FEWER}"
+        f"one lens, without zoom.\n{FEWER}"
     )
     reasons = [objections(cameras, names, longest) for cameras in solutions]
     good = [i for i, objection in enumerate(reasons) if not objection]

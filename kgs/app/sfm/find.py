@@ -8,15 +8,15 @@ from kgs.datasets import folders
 from kgs.datasets.folders import (
     HEIC_SUFFIXES,
     IMAGE_SUFFIXES,
-    MASK_FILES,
+    MASKS,
     MASKS_ARE_IN,
+    PICTURE_SUFFIXES,
     UNREADABLE_SUFFIXES,
     VIDEO_SUFFIXES,
     holds_picture,
     is_like_mask,
     list_images,
     list_pictures,
-    mask_folders,
 )
 from kgs.datasets.mask_files import find_mask_files
 
@@ -40,30 +40,28 @@ def find_photos(folder: Path) -> list[Path]:
         DataError: the folder does not exist, it holds fewer than 3 photos, or photos of a kind that cannot be read.
     """
     if not folder.is_dir():
-        raise DataError(folder, "", "expected a folder of photos, found no such folder")
+        raise DataError(folder, "", "a folder of photos", "no such folder")
     paths = list_photos(folder)
     converted = _converted(folder)
-    kinds = (*IMAGE_SUFFIXES, *UNREADABLE_SUFFIXES)
-    if lost := [path for path in list_images(folder, kinds) if not path.exists() and path not in converted]:
-        raise DataError(folder, "", f"expected photos, got links to files that are not there: {listed_files(lost)}")
+    if lost := [path for path in list_images(folder, PICTURE_SUFFIXES) if not path.exists() and path not in converted]:
+        raise DataError(folder, "", "photos", "links to files that are not there", advice=listed_files(lost))
     files = [path for path in sorted(folder.iterdir()) if path.is_file() and not path.name.startswith(".")]
     videos = [path for path in files if _is_video(path)]
     unreadable = set(UNREADABLE_SUFFIXES).difference(_readable())
     if others := [path for path in files if path.suffix.lower() in unreadable and path not in converted]:
-        wrong = f"{len(others)} of {len(others) + len(paths)} photos cannot be read ({listed_files(others)}). "
-        raise DataError(folder, "", wrong + CONVERT)
+        got = f"{len(others)} of {len(others) + len(paths)} of another kind ({listed_files(others)})"
+        raise DataError(folder, "", "photos that can be read", got, advice=CONVERT)
     if not paths and videos:
-        raise DataError(folder, "", f"holds no photos but several videos ({listed_files(videos)}): name one of them")
+        raise DataError(folder, "", "photos or a video", f"videos ({listed_files(videos)})", advice="name one of them")
     if not paths:
         deeper = [path for path in sorted(folder.iterdir()) if path.is_dir() and _holds_photos(path)]
-        if deeper:
-            reason = f"holds no photos itself, but these folders in it do: {listed_files(deeper)}. Name one of them"
-        else:
-            reason = f"expected photos ({' '.join(_readable())}), found none. {ADVICE}"
-        raise DataError(folder, "", ". ".join([reason, *folders.unused_files(folder), *_nameless(folder)]))
+        inner = f"these folders in it hold some: {listed_files(deeper)}. Name one of them"
+        advice = ". ".join([inner if deeper else ADVICE, *folders.unused_files(folder), *_nameless(folder)])
+        raise DataError(folder, "", f"photos ({' '.join(_readable())})", "none", advice=advice)
     if len(paths) < MIN_PHOTOS:
-        reason = f"expected at least {MIN_PHOTOS} photos, found {len(paths)} ({listed_files(paths)}). {ADVICE}"
-        raise DataError(folder, "", ". ".join([reason, *_nameless(folder)]))
+        advice = ". ".join([ADVICE, *_nameless(folder)])
+        got = f"{len(paths)} ({listed_files(paths)})"
+        raise DataError(folder, "", f"at least {MIN_PHOTOS} photos", got, advice=advice)
     return paths
 
 
@@ -71,7 +69,7 @@ def find_video(path: Path) -> Path | None:
     """The video that is meant by a path: this file, or the only one in a folder without photos; None: there is none."""
     if path.is_file():
         return path if _is_video(path) else None
-    if not path.is_dir() or list_images(path, (*IMAGE_SUFFIXES, *UNREADABLE_SUFFIXES)):
+    if not path.is_dir() or list_images(path, PICTURE_SUFFIXES):
         return None
     videos = [file for file in sorted(path.iterdir()) if file.is_file() and _is_video(file)]
     return videos[0] if len(videos) == 1 else None
@@ -100,8 +98,8 @@ def notes_on(folder: Path, masks: Path | None = None) -> list[str]:
 
 def _nameless(folder: Path) -> list[str]:
     """A sentence about files that are pictures, and not taken, because they are hidden or without a known ending."""
-    known = {*list_pictures(folder, (*IMAGE_SUFFIXES, *UNREADABLE_SUFFIXES))}
-    files = [path for path in sorted(folder.iterdir()) if path not in known and not path.name.startswith(MASK_FILES)]
+    known = {*list_pictures(folder, PICTURE_SUFFIXES)}
+    files = [path for path in sorted(folder.iterdir()) if path not in known]
     pictures = [path for path in files if path.is_file() and holds_picture(path)]
     return (
         [f"pictures that are not used, hidden or without a known ending: {listed_files(pictures)}"] if pictures else []
@@ -112,11 +110,11 @@ def _inner(folder: Path, masks: Path | None) -> list[str]:
     """A sentence about what is named like masks and not used, and one about other folders that may hold photos."""
     photos = list_photos(folder)
     files = find_mask_files(photos, folder, masks) if photos else None
-    used = [path.resolve() for path in (*mask_folders([folder]), *filter(None, [masks]))]
+    used = [path.resolve() for path in (folder / MASKS, *filter(None, [masks]))]
     inner = [path for path in sorted(folder.iterdir()) if path.is_dir() and path.resolve() not in used]
     inner = [path for path in inner if files is None or path not in files.unused]
     notes = files.notes(folder, _LISTED) if files else []
-    called = {path for path in inner if path.suffix.lower() in (*IMAGE_SUFFIXES, *UNREADABLE_SUFFIXES)}
+    called = {path for path in inner if path.suffix.lower() in PICTURE_SUFFIXES}
     if deeper := [path for path in inner if path in called or (_holds_photos(path) and not (path / MARKER).exists())]:
         notes.append(f"not looked into, because they are folders: {listed_files(deeper)}")
     return notes
@@ -139,6 +137,6 @@ def listed_files(paths: list[Path]) -> str:
 
 def _holds_photos(folder: Path) -> bool:
     try:
-        return any(path.suffix.lower() in (*IMAGE_SUFFIXES, *UNREADABLE_SUFFIXES) for path in folder.iterdir())
+        return any(path.suffix.lower() in PICTURE_SUFFIXES for path in folder.iterdir())
     except OSError:
         return False

@@ -47,13 +47,14 @@ def find_keypoints(photo: Photo, max_count: int) -> PhotoKeypoints:
     return PhotoKeypoints(pixels, keypoints.descriptors, frames)
 
 
-def write_matches(database: Path, photos: list[Photo], names: list[str], bar: ProgressBar) -> None:
+def write_matches(database: Path, photos: list[Photo], names: list[str], lenses: list[Any], bar: ProgressBar) -> None:
     """Make a COLMAP database of all photos with their lenses, their keypoints and the matches of each pair.
 
     Args:
         database: the file to write.
         photos: the photos, all of one size.
         names: their names in the database.
+        lenses: first guesses of their lenses, see :func:`lenses_of`.
         bar: wraps the loops to show their progress, see :mod:`kgs._support.progress`.
     """
     import pycolmap
@@ -63,7 +64,7 @@ def write_matches(database: Path, photos: list[Photo], names: list[str], bar: Pr
     keypoints = [find_keypoints(photo, max_count) for photo in bar(photos, "keypoints", "photo")]
     area = photos[0].size[::-1]
     with pycolmap.Database.open(database) as file:
-        ids = _write_photos(file, photos, names)
+        ids = _write_photos(file, photos, names, lenses)
         for image_id, of_photo in zip(ids, keypoints, strict=True):
             file.write_keypoints(image_id, of_photo.pixels.numpy())
         for i, j in bar(list(combinations(range(len(photos)), 2)), "matches", "pair"):
@@ -107,41 +108,34 @@ def exif_focal(photos: list[Photo]) -> float | None:
     return median_high(known) if known else None
 
 
-def exif_focals(photos: list[Photo]) -> list[float | None]:
-    """The same for each lens, in the order of their numbers."""
-    count = 1 + max(photo.lens for photo in photos)
-    return [exif_focal([photo for photo in photos if photo.lens == number]) for number in range(count)]
-
-
 def lenses_of(photos: list[Photo]) -> list[Any]:
     """First guesses of the photos' lenses, as cameras of pycolmap, in the order of their numbers."""
     import pycolmap
 
     width, height = photos[0].size
     cameras = []
-    for camera_id, known in enumerate(exif_focals(photos), 1):
+    for number in range(1 + max(photo.lens for photo in photos)):
+        known = exif_focal([photo for photo in photos if photo.lens == number])
         focal = known or DEFAULT_FOCAL * max(width, height)
-        camera = pycolmap.Camera.create_from_model_name(camera_id, "SIMPLE_RADIAL", focal, width, height)
+        camera = pycolmap.Camera.create_from_model_name(number + 1, "SIMPLE_RADIAL", focal, width, height)
         camera.has_prior_focal_length = known is not None
         cameras.append(camera)
     return cameras
 
 
-def _write_photos(file: Any, photos: list[Photo], names: list[str]) -> list[int]:
+def _write_photos(file: Any, photos: list[Photo], names: list[str], lenses: list[Any]) -> list[int]:
     """Write the lenses, and the photos; returns the photos' ids."""
     import pycolmap
 
-    cameras = lenses_of(photos)
     rig_ids = []
-    for camera in cameras:
-        camera.camera_id = file.write_camera(camera)
+    for lens in lenses:
+        lens.camera_id = file.write_camera(lens)
         rig = pycolmap.Rig()
-        rig.add_ref_sensor(camera.sensor_id)
+        rig.add_ref_sensor(lens.sensor_id)
         rig_ids.append(file.write_rig(rig))
     ids = []
     for photo, name in zip(photos, names, strict=True):
-        camera = cameras[photo.lens]
-        image = pycolmap.Image(name=name, camera_id=camera.camera_id)
+        image = pycolmap.Image(name=name, camera_id=lenses[photo.lens].camera_id)
         image.image_id = file.write_image(image)
         frame = pycolmap.Frame()
         frame.rig_id = rig_ids[photo.lens]
@@ -151,7 +145,9 @@ def _write_photos(file: Any, photos: list[Photo], names: list[str]) -> list[int]
     return ids
 
 
-def colmap_matching(photos: list[Photo], images: Path, masks: Path, work: Path, names: list[str]) -> dict[str, Any]:
+def colmap_matching(
+    photos: list[Photo], lenses: list[Any], images: Path, masks: Path, work: Path, names: list[str]
+) -> dict[str, Any]:
     """What the step `write_colmap_matches` takes: folders, names of each lens's photos, and the lens if it is known.
 
     Photos with alpha are written again over black: COLMAP would find keypoints in what alpha hides.
@@ -160,8 +156,8 @@ def colmap_matching(photos: list[Photo], images: Path, masks: Path, work: Path, 
         images = work / "opaque"
         images.mkdir()
         write_images(images, photos, names, opaque=True)
-    lenses = []
-    for number, lens in enumerate(lenses_of(photos)):
-        of_lens = [name for photo, name in zip(photos, names, strict=True) if photo.lens == number]
-        lenses.append((of_lens, lens.params_to_string() if lens.has_prior_focal_length else None))
-    return {"images": str(images), "masks": str(masks) if masks.is_dir() else None, "lenses": lenses}
+    of_lens = []
+    for number, lens in enumerate(lenses):
+        shown = [name for photo, name in zip(photos, names, strict=True) if photo.lens == number]
+        of_lens.append((shown, lens.params_to_string() if lens.has_prior_focal_length else None))
+    return {"images": str(images), "masks": str(masks) if masks.is_dir() else None, "lenses": of_lens}

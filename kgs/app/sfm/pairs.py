@@ -97,12 +97,12 @@ def without_overlap(
                 if maximum
                 else "it shows nothing that the others show"
             )
-            left[name] = f"{said}{missing_link(name, groups[0], pairs)}"
+            left[name] = f"{said}{what_would_help(name, groups[0], pairs)}"
     return left if len(names) - len(left) >= MIN_PHOTOS else {}
 
 
 def why_no_cameras(names: Sequence[str], pairs: Pairs, geometries: Mapping[tuple[str, str], PairGeometry]) -> str:
-    """Why matches cannot give cameras, and what to photograph next, as an error message; "" if they can.
+    """Why matches cannot give cameras, and what to photograph next, as the advice of an error; "" if they can.
 
     Args:
         names: the names of all photos.
@@ -129,7 +129,7 @@ def why_no_cameras(names: Sequence[str], pairs: Pairs, geometries: Mapping[tuple
         reason = f"the photos fall into {len(groups)} groups that do not overlap ({listed})"
         between = f"take photos from places between {' and '.join(weakest_link(names, pairs))}"
         advice = f"If they show two scenes, keep one group in the folder; if they show one, {between}"
-    return f"no cameras: {reason}. {advice}. {FEWER}.\n{table(names, pairs)}"
+    return f"{reason}.\n{advice}. {FEWER}.\n{table(names, pairs)}"
 
 
 def went_forward(geometries: Mapping[tuple[str, str], PairGeometry]) -> bool:
@@ -193,7 +193,7 @@ def table(names: Sequence[str], pairs: Pairs) -> str:
     return "\n".join(lines)
 
 
-def missing_link(name: str, others: Sequence[str], pairs: Pairs) -> str:
+def what_would_help(name: str, others: Sequence[str], pairs: Pairs) -> str:
     """Which photo would have helped one that is left out, as the end of a sentence."""
     between = " and ".join(gap(name, others, pairs))
     return f"; if it is of the same place, a photo from between {between} would have helped"

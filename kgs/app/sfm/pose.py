@@ -25,7 +25,16 @@ from kgs.app.files.publishing import UNFINISHED, complete, discard, replacing
 from kgs.app.files.results_folder import check_no_fit
 from kgs.datasets.image_file import color_notes
 
-from .accept import FOCAL_RANGE, MAX_DEGREES, MAX_RATIO, MIN_POINTS, MIN_RISE, accepted_cameras, say_left_out
+from .accept import (
+    FOCAL_RANGE,
+    MAX_DEGREES,
+    MAX_RATIO,
+    MIN_POINTS,
+    MIN_RISE,
+    Accepted,
+    accepted_cameras,
+    say_left_out,
+)
 from .find import find_photos, find_video
 from .map import Cameras, quiet_pycolmap
 from .match import exif_focal
@@ -65,9 +74,8 @@ def pose_photos(
             length, else they are left out. Folders in it are not looked into. Or a video, or a folder with one and
             without photos.
         out: the folder for the results, created if it does not exist.
-        masks: the folder of their masks, white where a photo is kept; None: `masks` in `folder`, if there is one, and
-            masks beside the photos, as `IMG_1_mask.png`. What is black is not matched, and `out` gets the masks in
-            `masks`.
+        masks: the folder of their masks, white where a photo is kept; None: `masks` in `folder`, if there is one.
+            What is black is not matched, and `out` gets the masks in `masks`.
         seed: of the solvers. The same photos and seed give the same files, but for the times in photos.json.
         frames: the number of frames that are taken from a video; see :func:`kgs.app.sfm.video.take_frames`.
         wait: write new files to the folder `unfinished` in `out`, until a fit to them is done: a former one in `out`
@@ -140,13 +148,13 @@ def _pose_video(video: Path, out: Path, frames: int | None, options: dict[str, A
             return pose_photos(folder, out, **options)
         except DataError as error:
             path = video if Path(error.path) == folder else error.path
-            raise type(error)(path, error.field, error.reason) from error
+            raise type(error)(path, error.key, error.expected, error.got, advice=error.advice) from error
 
 
 def find_cameras(
     opened: list[OpenPhoto], new: Path, seed: int, bar: ProgressBar, say: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Write `images` and `sparse/0` of photos to the folder `new`; returns the report.
+    """Write `images`, `masks` and `sparse/0` of photos to the folder `new`; returns the report.
 
     Raises:
         PhotosRefused: the photos do not fit together, or their cameras cannot be trusted.
@@ -155,66 +163,90 @@ def find_cameras(
     unlike = unlike_others(opened)
     say_left_out(unlike, say)
     opened = [photo for photo in opened if photo.name not in unlike]
-    names = [photo.name for photo in opened]
+    png = png_names([photo.name for photo in opened])
+    names = {image: name for name, image in png.items()}
     work = new / "work"
-    images = new / IMAGES
-    for path in (images, work):
-        path.mkdir(parents=True)
+    work.mkdir(parents=True)
     with quiet_pycolmap(), _one_thread(), report_full_disk(new):
         photos = read_photos(opened, bar)
-        for photo in photos:
-            if photo.whole:
-                say(f"{photo.name}: only its middle is taken, because it has another shape than most photos")
-        for note in color_notes([photo.image for photo in opened]):
-            say(note)
         unsharp = [photo.name for photo in blurred(photos)]
-        if unsharp:
-            say(f"blurred beside the others: {', '.join(unsharp)}; if the fit shows it, take them again")
-        png = png_names(names)
-        photo_names = {image: name for name, image in png.items()}
-        folders = images, new / MASKS
-        write_images(images, [photo.upright() for photo in photos], list(png.values()))
-        write_masks(new / MASKS, [photo.upright() for photo in photos], list(png.values()))
+        _say_notes(opened, photos, unsharp, say)
+        folders = _write_photos(new, [photo.upright() for photo in photos], list(names))
         turned = {photo.name for photo in photos if photo.is_turned}
         if turned:
-            folders = work / IMAGES, work / MASKS
-            folders[0].mkdir()
-            write_images(folders[0], photos, list(png.values()))
-            write_masks(folders[1], photos, list(png.values()))
+            folders = _write_photos(work, photos, list(names))
         lap("photos")
-        found = accepted_cameras(photos, *folders, work, photo_names, seed, bar, lap, say)
+        found = accepted_cameras(photos, *folders, work, names, seed, bar, lap, say)
         for name in found.rejected:
-            (images / png[name]).unlink()
+            (new / IMAGES / png[name]).unlink()
             (new / MASKS / f"{png[name]}.png").unlink(missing_ok=True)
         if found.held:
             focals = " and ".join(f"{focal:.0f}" for focal in found.held)
             say(f"the photos do not tell the focal length; the Exif says {focals} pixels, and that is taken")
-        photos = [photo for photo in photos if photo.name not in found.rejected]
-        chosen = upright(found.cameras, turned, photo_names)
-        level_and_scale(chosen)
-        write_model(new / MODEL, chosen, images)
+        cameras = upright(found.cameras, turned, names)
+        level_and_scale(cameras)
+        write_model(new / MODEL, cameras, new / IMAGES)
         shutil.rmtree(work)
         lap("files")
-    error = float(chosen.reconstruction.compute_mean_reprojection_error())
-    say(f"cameras: {len(photos)} photos placed, {chosen.reconstruction.num_points3D()} points, {error:.2f} pixels off")
+    placed = [photo for photo in photos if photo.name not in found.rejected]
+    report = _report(found, cameras, placed)
+    points, error = report["points"], report["reprojection_error_px"]
+    say(f"cameras: {len(placed)} photos placed, {points} points, {error:.2f} pixels off")
     return {
-        **_lens(chosen, photos),
+        **report,
         "photo_size": list(min(photo.size for photo in opened)),
-        "focal_rise": None if found.held else chosen.focal_rise,
         "photos": {
             photo.name: {
                 "image": png[photo.name],
-                "points": chosen.points[photo.name],
+                "points": cameras.points[photo.name],
                 "blurred": photo.name in unsharp,
-                "focal_px": chosen.focals[photo.name],
+                "focal_px": cameras.focals[photo.name],
                 "exif_focal_35mm": photo.exif.focal_35mm,
             }
-            for photo in photos
+            for photo in placed
         },
         "left_out": unlike | found.rejected,
+        "seconds": seconds,
+        "versions": {**versions(), "pycolmap": version("pycolmap")},
+    }
+
+
+def _say_notes(opened: list[OpenPhoto], photos: list[Photo], unsharp: list[str], say: Callable[[str], None]) -> None:
+    for photo in photos:
+        if photo.is_cut:
+            say(f"{photo.name}: only its middle is taken, because it has another shape than most photos")
+    for note in color_notes([photo.image for photo in opened]):
+        say(note)
+    if odd := [photo.name for photo in opened if photo.has_odd_focal]:
+        say(f"a focal length in the Exif that no lens has is passed over: {', '.join(odd)}")
+    if unsharp:
+        say(f"blurred beside the others: {', '.join(unsharp)}; if the fit shows it, take them again")
+
+
+def _write_photos(folder: Path, photos: list[Photo], names: list[str]) -> tuple[Path, Path]:
+    """Write photos and their masks; returns the folders of both. That of the masks is not there if there are none."""
+    (folder / IMAGES).mkdir()
+    write_images(folder / IMAGES, photos, names)
+    write_masks(folder / MASKS, photos, names)
+    return folder / IMAGES, folder / MASKS
+
+
+def _report(found: Accepted, cameras: Cameras, photos: list[Photo]) -> dict[str, Any]:
+    """What the report says about the cameras and the lens of most photos."""
+    scene = cameras.reconstruction
+    usual = [photo for photo in photos if cameras.focals[photo.name] == cameras.focal]
+    lens = next(lens for lens in scene.cameras.values() if lens.focal_length == cameras.focal)
+    width, height = photos[0].size
+    return {
+        "size": [width, height],
+        "focal_px": cameras.focal,
+        "focal_35mm": cameras.focal * FILM_DIAGONAL / float((width**2 + height**2) ** 0.5),
+        "exif_focal_px": exif_focal(usual),
+        "focal_rise": None if found.held else cameras.focal_rise,
+        "radial_distortion": float(lens.params[3]),
         "matches": [[*pair, count] for pair, count in found.pairs.items()],
-        "points": chosen.reconstruction.num_points3D(),
-        "reprojection_error_px": error,
+        "points": scene.num_points3D(),
+        "reprojection_error_px": float(scene.compute_mean_reprojection_error()),
         "solver": found.solver,
         "agreement_degrees": found.degrees,
         "gates": {
@@ -225,24 +257,6 @@ def find_cameras(
             "min_focal_rise": MIN_RISE,
             "passed": True,
         },
-        "seconds": seconds,
-        "versions": {**versions(), "pycolmap": version("pycolmap")},
-    }
-
-
-def _lens(cameras: Cameras, photos: list[Photo]) -> dict[str, Any]:
-    """What the report says about image size and the lens of most photos."""
-    usual = [photo for photo in photos if cameras.focals[photo.name] == cameras.focal]
-    scene = cameras.reconstruction
-    lens = next(lens for lens in scene.cameras.values() if lens.focal_length == cameras.focal)
-    width, height = photos[0].size
-    film = cameras.focal * FILM_DIAGONAL / float((width**2 + height**2) ** 0.5)
-    return {
-        "size": [width, height],
-        "focal_px": cameras.focal,
-        "focal_35mm": film,
-        "exif_focal_px": exif_focal(usual),
-        "radial_distortion": float(lens.params[3]),
     }
 
 

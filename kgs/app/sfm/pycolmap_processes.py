@@ -40,12 +40,7 @@ class PycolmapProcesses:
                 process.kill()
 
     def run(self, step: str, database: Path, **arguments: Any) -> None:
-        """Run one of the functions below by its name, without the underscore, and wait for it.
-
-        Args:
-            step: the name.
-            database: the file that it writes.
-            arguments: what else it takes; JSON has to know them.
+        """Run one of the `STEPS` below, and wait for it; its arguments go there as JSON.
 
         Raises:
             OSError: the disk is full.
@@ -102,12 +97,11 @@ def _failure(code: int, said: str, database: Path) -> Exception:
 
 
 def _write_colmap_matches(
-    pycolmap: Any, database: str, images: str, lenses: list[tuple[list[str], str | None]], masks: str | None, seed: int
+    database: str, images: str, lenses: list[tuple[list[str], str | None]], masks: str | None, seed: int
 ) -> None:
     """Write COLMAP's own keypoints and verified matches of photos.
 
     Args:
-        pycolmap: the module.
         database: the file to write.
         images: the folder of the photos.
         lenses: for each the names of its photos in the folder, and the parameters of the SIMPLE_RADIAL lens where they
@@ -115,6 +109,8 @@ def _write_colmap_matches(
         masks: the folder of their masks, named as the photos with .png behind; None: all of each photo is kept.
         seed: of the verification.
     """
+    import pycolmap
+
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = "SIMPLE_RADIAL"
     if masks is not None:
@@ -141,23 +137,30 @@ def _write_colmap_matches(
     pycolmap.match_exhaustive(
         database,
         matching_options=matching,
-        verification_options=_two_view_options(pycolmap, seed),
+        verification_options=_two_view_options(seed),
         device=pycolmap.Device.cpu,
     )
 
 
-def _verify(pycolmap: Any, database: str, seed: int) -> None:
+def _verify(database: str, seed: int) -> None:
     """Keep the matches of each pair that one motion of the camera explains."""
+    import pycolmap
+
     verifier = pycolmap.GeometricVerifierOptions()
     verifier.num_threads = 1
-    pycolmap.geometric_verification(database, verifier, two_view_geometry_options=_two_view_options(pycolmap, seed))
+    pycolmap.geometric_verification(database, verifier, two_view_geometry_options=_two_view_options(seed))
 
 
-def _two_view_options(pycolmap: Any, seed: int) -> Any:
+def _two_view_options(seed: int) -> Any:
+    import pycolmap
+
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = seed
     options.detect_watermark = False
     return options
+
+
+STEPS: dict[str, Callable[..., None]] = {"write_colmap_matches": _write_colmap_matches, "verify": _verify}
 
 
 def _end_with_the_parent() -> None:
@@ -178,8 +181,7 @@ def _main() -> None:
     import pycolmap
 
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
-    steps: dict[str, Callable[..., None]] = {"write_colmap_matches": _write_colmap_matches, "verify": _verify}
-    steps[request["step"]](pycolmap, request["database"], **request["arguments"])
+    STEPS[request["step"]](request["database"], **request["arguments"])
 
 
 if __name__ == "__main__":

@@ -35,6 +35,7 @@ _PIXELS_X = 0xA002
 _DENSITY = 0xA20E
 _DENSITY_UNIT = 0xA210
 _UNITS = {2: 25.4, 3: 10.0, 4: 1.0}  # mm, in which the density of pixels is given
+_LENSES = 0.2, 10.0  # focal lengths over the longer side: a fisheye of 8 mm, a telephoto lens of 360 mm
 _PANORAMA = b"equirectangular"  # in XMP, https://developers.google.com/streetview/spherical-metadata
 _SEAM = 2.0  # how much more than neighbouring columns the first and the last one of a panorama may differ
 _SAME_ZOOM = 1.1  # largest ratio of focal lengths that counts as one lens without zoom
@@ -70,11 +71,11 @@ class Exif(NamedTuple):
         return self.orientation > 4
 
     def focal_ratio(self, width: int, height: int) -> float | None:
-        """The focal length over the longer side of a photo of this shape, or None."""
-        if self.focal_35mm:
-            return self.focal_35mm / FILM_DIAGONAL * math.hypot(width, height) / max(width, height)
+        """The focal length over the longer side of a photo of this shape; None if there is none that a lens has."""
         stored = height if self.is_sideways else width
-        return self.focal_over_width * stored / max(width, height) if self.focal_over_width else None
+        over_film = (self.focal_35mm or 0.0) / FILM_DIAGONAL * math.hypot(width, height) / max(width, height)
+        over_sensor = (self.focal_over_width or 0.0) * stored / max(width, height)
+        return next((ratio for ratio in (over_film, over_sensor) if _LENSES[0] <= ratio <= _LENSES[1]), None)
 
 
 def _number(tags: Mapping[int, Any], tag: int) -> float:
@@ -121,6 +122,11 @@ class OpenPhoto(NamedTuple):
         """The focal length over the longer side that Exif gives, None if it does not."""
         return self.exif.focal_ratio(*self.size)
 
+    @property
+    def has_odd_focal(self) -> bool:
+        """Whether the Exif gives focal lengths, none of which a lens has."""
+        return bool(self.exif.focal_35mm or self.exif.focal_over_width) and not self.focal_ratio
+
 
 @dataclass(frozen=True, eq=False)
 class Photo:
@@ -130,9 +136,10 @@ class Photo:
     exif: Exif
     pixels: NDArray[np.uint8]  # `(H, W, 3)` RGB or `(H, W, 4)` RGBA, not premultiplied
     mask: NDArray[np.uint8] | None = None  # `(H, W)`, 255 where the photo is kept, 0 elsewhere; None: all is
-    is_turned: bool = False  # whether it is upright only after a quarter turn counterclockwise
+    focal: float | None = None  # focal length in pixels that Exif gives, None if it does not
     lens: int = 0  # the number of its lens; 0 took most photos
-    whole: tuple[int, int] | None = None  # width and height of all of it, as `size`, where its sides are cut off
+    is_turned: bool = False  # whether it is upright only after a quarter turn counterclockwise
+    is_cut: bool = False  # whether it is the middle of a photo of another shape
 
     @property
     def name(self) -> str:
@@ -144,13 +151,6 @@ class Photo:
         """Width and height in pixels."""
         height, width = self.pixels.shape[:2]
         return width, height
-
-    @property
-    def focal(self) -> float | None:
-        """The focal length in pixels that Exif gives, None if it does not."""
-        width, height = self.whole or self.size
-        ratio = self.exif.focal_ratio(*((height, width) if self.is_turned else (width, height)))
-        return ratio * max(width, height) if ratio else None
 
     def upright(self) -> Self:
         """The photo as it is looked at."""
@@ -177,11 +177,10 @@ class Photo:
 def open_photos(paths: list[Path], masks: Path | None = None) -> list[OpenPhoto]:
     """Open photos without decoding them. `read_photos` decodes the bytes that are read here, and opens no file again.
 
-    `masks` is a folder with masks of photos; None: those in `masks/` or `mask/` beside the photos. Others are beside
-    their photos.
+    `masks` is a folder with masks of photos; None: `masks/` beside the photos, if there is one.
 
     Raises:
-        DataError: a file cannot be read or is not a photo, or a mask is of no photo.
+        DataError: a file cannot be read or is not a photo, or masks are refused.
     """
     found = as_masks(find_mask_files(paths, paths[0].parent, masks)) if paths else {}
     return [_open(path, found.get(path)) for path in paths]
@@ -191,7 +190,7 @@ def _open(path: Path, mask: Mask | None) -> OpenPhoto:
     image = ImageFile(path)
     data = image.load()
     if data[4:8] == b"ftyp" and not (image_file.is_heic(data) and folders.has_heic()):
-        raise DataError(path, "", f"is a HEIC photo or a video under another name. {CONVERT}")
+        raise DataError(path, "", "a photo", "a HEIC photo or a video under another name", advice=CONVERT)
     exif = Exif.of(image.metadata.tags)
     width, height = image.size
     size = (height, width) if exif.is_sideways else (width, height)
@@ -209,41 +208,37 @@ def read_photos(opened: list[OpenPhoto], bar: ProgressBar) -> list[Photo]:
     """
     lying_is_usual = 2 * sum(photo.size[0] > photo.size[1] for photo in opened) >= len(opened)
     usual = max(by_shape(opened).values(), key=len)[0].size
-    lies = {photo.name: _lies(photo.size, lying_is_usual) for photo in opened}
-    parts = {photo.name: _middle(photo.size, usual, lies[photo.name]) for photo in opened}
-    width, height = min(sorted(part, reverse=lying_is_usual) for part in parts.values())
+    lies = [width > height or (width == height and lying_is_usual) for width, height in (p.size for p in opened)]
+    parts = [_middle(photo.size, usual, lying) for photo, lying in zip(opened, lies, strict=True)]
+    width, height = min(sorted(part, reverse=lying_is_usual) for part in parts)
     scale = min(1.0, LONGEST / max(width, height))
     size = max(1, round(width * scale)), max(1, round(height * scale))
     lenses = _lens_numbers(opened)
     photos = []
-    for photo in bar(opened, "photos", "photo"):
+    for photo, lying, part in zip(bar(opened, "photos", "photo"), lies, parts, strict=True):
+        is_turned = lying != lying_is_usual and width != height
+        kept_size = size[::-1] if is_turned else size
+        # width and height of the whole photo where its part has this size
+        whole = round(kept_size[0] * photo.size[0] / part[0]), round(kept_size[1] * photo.size[1] / part[1])
         pixels = np.ascontiguousarray(turn(photo.image.read(), photo.exif.orientation))
         kept = _kept(photo)
-        is_turned = lies[photo.name] != lying_is_usual and width != height
-        part = size[::-1] if is_turned else size
-        whole = _larger(part, photo.size, parts[photo.name])
-        upright = _reduced(pixels, whole, kept)
+        image = _reduced(pixels, whole, kept)
         mask = None if kept is None else np.where(reduce(kept, *whole) >= 0.5, np.uint8(255), np.uint8(0))
+        ratio = photo.exif.focal_ratio(*whole)
         quarters = -1 if is_turned else 0  # clockwise
-        turned = whole[::-1] if is_turned else whole
         photos.append(
             Photo(
                 photo.path,
                 photo.exif,
-                np.ascontiguousarray(np.rot90(_cut(upright, part), quarters)),
-                None if mask is None else np.ascontiguousarray(np.rot90(_cut(mask, part), quarters)),
-                is_turned,
+                np.ascontiguousarray(np.rot90(_cut(image, kept_size), quarters)),
+                None if mask is None else np.ascontiguousarray(np.rot90(_cut(mask, kept_size), quarters)),
+                ratio * max(whole) if ratio else None,
                 lenses[photo.name],
-                turned if whole != part else None,
+                is_turned,
+                is_cut=whole != kept_size,
             )
         )
     return photos
-
-
-def _lies(size: tuple[int, int], lying_is_usual: bool) -> bool:
-    """Whether an image is wider than high; a square one counts as most do."""
-    width, height = size
-    return width > height or (width == height and lying_is_usual)
 
 
 def _middle(size: tuple[int, int], shape: tuple[int, int], lies: bool) -> tuple[int, int]:
@@ -253,11 +248,6 @@ def _middle(size: tuple[int, int], shape: tuple[int, int], lies: bool) -> tuple[
     width, height = size
     ratio = max(shape) / min(shape) if lies else min(shape) / max(shape)
     return min(width, round(height * ratio)), min(height, round(width / ratio))
-
-
-def _larger(part: tuple[int, int], size: tuple[int, int], middle: tuple[int, int]) -> tuple[int, int]:
-    """Width and height of an image of which `part` is what `middle` is of `size`."""
-    return round(part[0] * size[0] / middle[0]), round(part[1] * size[1] / middle[1])
 
 
 def _cut(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
@@ -347,83 +337,54 @@ def unlike_others(photos: list[OpenPhoto]) -> dict[str, str]:
         PhotosRefused: most photos are panoramas, there are fewer than `MIN_PHOTOS` without copies, or no shape is that
             of most.
     """
-    folder = photos[0].path.parent
     panoramas = [photo.path for photo in photos if photo.is_panorama]
     if 2 * len(panoramas) > len(photos):
         line = f'ffmpeg -i "{panoramas[0].name}" -vf v360=e:rectilinear:h_fov=90:v_fov=67:yaw=0 yaw_0.jpg'
-        reason = f"is a panorama, not a picture of a lens. Cut some from it: `{line}`, the same for other angles"
-        raise PhotosRefused(panoramas[0], "", reason)
-    first = {photo.sha256: photo.name for photo in reversed(photos)}
-    copied = {photo.name: first[photo.sha256] for photo in photos if first[photo.sha256] != photo.name}
-    left = {name: f"it is the same photo as {other}" for name, other in copied.items()}
-    if copied and len(photos) - len(left) < MIN_PHOTOS:
-        name, other = next(iter(copied.items()))
+        advice = f"cut some from it: `{line}`, the same for other angles"
+        raise PhotosRefused(panoramas[0], "", "a picture of a lens", "a panorama", advice=advice)
+    first = {photo.sha256: photo for photo in reversed(photos)}
+    copies = [photo for photo in photos if photo is not first[photo.sha256]]
+    if copies and len(first) < MIN_PHOTOS:
         advice = "two copies show no depth. Remove one, and take another photo from a step to the side"
-        reason = f"is the same photo as {other}: {advice}"
-        raise PhotosRefused(photos[0].path.with_name(name), "", reason)
-    photos = [photo for photo in photos if photo.name not in left]
-    shapes = by_shape(photos)
-    if (usual := _usual(shapes)) is None:
-        groups = _listed(shapes)
-        reason = f"expected photos of one shape, got {len(shapes)} ({groups}). Keep one group in the folder"
-        raise PhotosRefused(folder, "", f"{reason}. Cropped photos do not fit those that are whole")
-    return left | {
-        photo.name: f"its shape is {name}, not {usual}, and no Exif says its focal length: is it cropped?"
-        for photo, name in _of_unknown_lens(shapes, usual)
+        expected = f"another photo than {first[copies[0].sha256].name}"
+        raise PhotosRefused(copies[0].path, "", expected, "the same", advice=advice)
+    shapes = by_shape([photo for photo in photos if photo is first[photo.sha256]])
+    usual = max(shapes, key=lambda shape: len(shapes[shape]))
+    others = {
+        photo.name: f"its shape is {shape}, not {usual}, and no Exif says its focal length: is it cropped?"
+        for shape, group in shapes.items()
+        for photo in group
+        if shape != usual and not photo.focal_ratio
     }
-
-
-def _usual(groups: Mapping[str, list[OpenPhoto]]) -> str | None:
-    """The largest group, or None if others would be left out, and it has too few photos or no more than another one."""
-    usual = max(groups, key=lambda name: len(groups[name]))
-    sizes = sorted((len(group) for group in groups.values()), reverse=True)
-    if _of_unknown_lens(groups, usual) and (sizes[0] < MIN_PHOTOS or sizes[0] == sizes[1]):
-        return None
-    return usual
-
-
-def _of_unknown_lens(groups: Mapping[str, list[OpenPhoto]], usual: str) -> list[tuple[OpenPhoto, str]]:
-    """The photos of other groups, and the name of each one's group, whose Exif says no focal length."""
-    others = [(photo, name) for name, group in groups.items() for photo in group if name != usual]
-    return [(photo, name) for photo, name in others if not photo.focal_ratio]
-
-
-def _listed(groups: Mapping[str, list[OpenPhoto]]) -> str:
-    return "; ".join(f"{name}: {listed_files([photo.path for photo in group])}" for name, group in groups.items())
+    counts = sorted(map(len, shapes.values()), reverse=True)
+    if others and (counts[0] < MIN_PHOTOS or counts[0] == counts[1]):
+        groups = "; ".join(f"{shape}: {listed_files([p.path for p in group])}" for shape, group in shapes.items())
+        advice = "keep one group in the folder. Cropped photos do not fit those that are whole"
+        folder = photos[0].path.parent
+        raise PhotosRefused(folder, "", "photos of one shape", f"{len(shapes)} ({groups})", advice=advice)
+    return {photo.name: f"it is the same photo as {first[photo.sha256].name}" for photo in copies} | others
 
 
 def _lens_numbers(photos: list[OpenPhoto]) -> dict[str, int]:
     """The number of each photo's lens by its name; 0 took most.
 
-    Photos of each shape have lenses of their own, one for each focal length of the Exif. The first of them took also
-    those whose Exif says none.
+    Photos of each shape have lenses of their own, one for each focal length of the Exif: those that differ by at most
+    10 % are one. The first of them took also those whose Exif says none.
     """
     lenses = list[list[OpenPhoto]]()
     for group in by_shape(photos).values():
-        unknown = [photo for photo in group if not photo.focal_ratio]
-        first, *others = sorted(by_lens(group).values(), key=len, reverse=True) or [[]]
-        lenses += [[*first, *unknown], *others]
+        zooms = list[list[OpenPhoto]]()
+        shortest = 0.0
+        for ratio, photo in sorted(((p.focal_ratio, p) for p in group if p.focal_ratio), key=lambda pair: pair[0]):
+            if ratio > _SAME_ZOOM * shortest:
+                shortest = ratio
+                zooms.append([])
+            zooms[-1].append(photo)
+        first, *others = sorted(zooms, key=len, reverse=True) or [[]]
+        lenses += [[*first, *(photo for photo in group if not photo.focal_ratio)], *others]
     lenses.sort(key=len, reverse=True)
     return {photo.name: number for number, lens in enumerate(lenses) for photo in lens}
 
 
 def _same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
-    long, short = max(one), min(one)
-    return Intrinsics(long, short, 1, 1, 0, 0).same_aspect(max(other), min(other))
-
-
-def by_lens(photos: list[OpenPhoto]) -> dict[str, list[OpenPhoto]]:
-    """The photos by the focal length of their Exif, as "28 mm" on 35 mm film; those without one are in no group.
-
-    A group's focal lengths differ by at most 10 %.
-    """
-    groups = dict[str, list[OpenPhoto]]()
-    shortest = 0.0
-    for ratio, photo in sorted(((p.focal_ratio, p) for p in photos if p.focal_ratio), key=lambda pair: pair[0]):
-        if ratio > _SAME_ZOOM * shortest:
-            shortest = ratio
-            group = list[OpenPhoto]()
-            film = ratio * FILM_DIAGONAL * max(photo.size) / math.hypot(*photo.size)
-            groups[f"{film:.0f} mm"] = group
-        group.append(photo)
-    return groups
+    return Intrinsics(max(one), min(one), 1, 1, 0, 0).same_aspect(max(other), min(other))

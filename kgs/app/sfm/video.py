@@ -72,8 +72,8 @@ def take_frames(
     way = frames[-1].way
     min_way = _STEP * ((count or MIN_PHOTOS) - 1)
     if way < min_way or len(frames) < MIN_PHOTOS:
-        expected = f"expected a video in which the camera moves by {min_way:g} degrees or more"
-        raise PhotosRefused(video, "", f"{expected}, got {way:.1f} degrees in {len(frames)} frames")
+        expected = f"a video in which the camera moves by {min_way:g} degrees or more"
+        raise PhotosRefused(video, "", expected, f"{way:.1f} degrees in {len(frames)} frames")
     if count is None:
         count = max(MIN_PHOTOS, min(FRAMES, round(way / MIN_DEGREES) + 1))
         count = max(count, min(MAX_FRAMES, math.ceil(way / MAX_DEGREES) + 1))
@@ -83,7 +83,7 @@ def take_frames(
         for index in bar(indices, "frames", "frame"):
             pixels = reader.read(index)
             if pixels is None:
-                raise DataError(video, "", f"frame {index} cannot be read a second time")
+                raise DataError(video, "", f"frame {index} a second time", "none")
             paths.append(folder / f"frame_{index:05d}.png")
             write_png(paths[-1], torch.from_numpy(pixels[..., ::-1].copy()).permute(2, 0, 1))
     say(f"{video.name}: {len(paths)} frames, {way / (len(paths) - 1):.0f} degrees apart in the mean")
@@ -103,7 +103,7 @@ def _look(video: Path, bar: ProgressBar) -> list[_Frame]:
             grey = _small(pixels)
             frames.append(_Frame(index, sharpness(grey), motion.way_to(grey)))
     if not frames:
-        raise DataError(video, "", "expected a video, got a file without frames that can be decoded")
+        raise DataError(video, "", "a video", "a file without frames that can be decoded")
     return frames
 
 
@@ -165,7 +165,7 @@ class _Reader:
     def __init__(self, video: Path) -> None:
         path = for_opencv(video)
         if path is None:
-            raise DataError(video, "", f"expected a video that OpenCV can open: {NOT_UTF8}")
+            raise DataError(video, "", "a video that OpenCV can open", advice=f"{NOT_UTF8}")
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # else FFmpeg writes of damage to stderr
         self._capture = cv2.VideoCapture(str(path))
         self._next = 0

@@ -21,7 +21,7 @@ def check_workspace(out: Path, paths: list[Path]) -> None:
     photos = folder.resolve()
     results = [out / IMAGES, out / MASKS, out / "sparse"]
     if photos == out.resolve() or any(photos.is_relative_to(path.resolve()) for path in results):
-        raise DataError(out, "", "holds the photos themselves: choose another folder")
+        raise DataError(out, "", "another folder than that of the photos")
     check_folder(out, folder, make=False)
     images = [f"{IMAGES}/{name}" for name in png_names(path.name for path in paths).values()]
     masks = [f"{MASKS}/{Path(name).name}.png" for name in images]

@@ -50,9 +50,9 @@ def upright(cameras: Cameras, turned: set[str], names: Mapping[str, str]) -> Cam
     """
     if turned.isdisjoint(cameras.rotations):
         return cameras
-    scene = cameras.reconstruction
     import pycolmap
 
+    scene = cameras.reconstruction
     found = pycolmap.Reconstruction()
     count = max(scene.cameras)
     for camera_id, lens in scene.cameras.items():
