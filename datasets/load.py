@@ -3,7 +3,6 @@
 import math
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from os import PathLike
@@ -15,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kgs._support.default_device import on_cpu
 from kgs._support.errors import ArgumentError, DataError, listed
 from kgs.geometry.cameras import pinhole_cameras
 
@@ -101,8 +101,7 @@ def load_scene(
     check_options(downscale, hold_out, background, points, mask_mode)
     source = SceneSource.of(path)
     root = source.root
-    # The context torch.device("cpu") slows torch down: it is entered only if the default device is another.
-    with nullcontext() if torch.get_default_device().type == "cpu" else torch.device("cpu"):
+    with on_cpu():
         frame_set = _with_masks(root, source.frames(photo_folder), None if masks is None else Path(masks))
         train, test = _split(root, frame_set, train_views, hold_out)
         cloud = frame_set.points

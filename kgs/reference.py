@@ -15,6 +15,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs._support.checks import check_intrinsics, check_kind, check_tensor
+from kgs._support.default_device import cpu_by_default
 
 from .geometry.types import Gaussians, RasterOptions
 
@@ -86,6 +87,7 @@ def render(
     return image[None]
 
 
+@cpu_by_default
 def layers(
     gaussians: Gaussians,
     camera: PinholeCamera,

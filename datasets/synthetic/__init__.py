@@ -15,6 +15,7 @@ from kornia.geometry.camera import PinholeCamera
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kgs._support.default_device import on_cpu
 from kgs._support.errors import ArgumentError
 from kgs.datasets.scene import Scene, Views
 from kgs.geometry.cameras import image_size, pinhole_cameras, resized, select, to
@@ -55,7 +56,7 @@ def synthetic_scene(
             raise ArgumentError(name, f"at least {minimum}", value)
     world = _make_world(seed)
     train_eyes, test_eyes = _patch_eyes(train_views, test_views, np.random.default_rng([seed, 1]))
-    with torch.device("cpu"):  # whatever torch's default is
+    with on_cpu():
         train = _views(world, train_eyes, size, "train")
         test = _views(world, test_eyes, size, "test")
         no_points = torch.zeros(0, 3, dtype=torch.float32)

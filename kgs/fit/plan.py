@@ -7,6 +7,7 @@ from typing import NamedTuple, Self
 import torch
 
 from kgs._support.checks import check_kind
+from kgs._support.default_device import cpu_by_default
 from kgs._support.machine import check_device
 from kgs.backends import resolve
 from kgs.datasets.scene import Scene
@@ -64,6 +65,7 @@ class Plan:
         return cls(config, device, backend, limit, make_schedule(config), decisions)
 
 
+@cpu_by_default
 def make_plan(scene: Scene, config: FitConfig, points: InitialPoints) -> Plan:
     """Settle all that a configuration leaves open.
 

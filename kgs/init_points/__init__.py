@@ -9,6 +9,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs._support.checks import check_kind
+from kgs._support.default_device import cpu_by_default
 from kgs._support.errors import ArgumentError, quoted, warn
 from kgs._support.machine import check_device
 from kgs._support.progress import ProgressBar, silent
@@ -49,6 +50,7 @@ class InitialPoints(ShownByShapes):
     views: Tensor | None = None
 
 
+@cpu_by_default
 def initial_points(
     views: Views,
     kind: str = "dense",

@@ -128,7 +128,8 @@ def test_imports_go_one_way():
 def test_what_single_files_may_import():
     assert {name.split(".")[0] for name in imports("kgs.drop")} - set(sys.stdlib_module_names) == {"torch"}
     assert [name for name in SOURCES if any(within(other, "kornia.sensors") for other in imports(name))] == [SENSORS]
-    assert imported_modules("kgs.reference") == {"kgs._support.checks", "kgs.geometry.types"}
+    support = {"kgs._support.checks", "kgs._support.default_device"}
+    assert imported_modules("kgs.reference") == {*support, "kgs.geometry.types"}
     assert {name for name in imports("kgs.reference") if name.startswith("kornia")} == {PINHOLE}
 
 
