@@ -34,6 +34,7 @@ __all__ += ["ArgumentError", "DataError", "TrainingDiverged", "wait_passively"]
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
+        "kgs.cameras": (),
         "kgs.geometry.cameras": ("PosedCamera", "pinhole_cameras"),
         "kgs.compressed_ply": ("save_compressed_ply",),
         "kgs.densify": ("Densifier", "DensifyReport"),

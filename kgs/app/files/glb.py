@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from kornia.color import rgb_to_linear_rgb
 from kornia.geometry.conversions import rotation_matrix_to_quaternion
 from numpy.typing import NDArray
 from torch import Tensor
@@ -157,7 +158,8 @@ def _unit_quaternions(quats: Tensor) -> Tensor:
 def _linear_colors(harmonics: Tensor) -> Tensor:
     """The colours of degree 0 as linear RGB, which COLOR_0 requires, `(N, 3)` float64; the model's are sRGB."""
     srgb = (SH_C0 * harmonics[:, 0].double() + 0.5).clamp(0, 1)
-    return torch.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    linear: Tensor = rgb_to_linear_rgb(srgb.T[..., None])[..., 0].T
+    return linear
 
 
 def _chunk(kind: bytes, content: bytes) -> bytes:
