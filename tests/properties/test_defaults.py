@@ -96,7 +96,6 @@ def test_the_reference_scenes_and_fits_are_the_same_under_other_defaults(scene, 
     makers = {
         "reference": lambda: kgs.reference.render(GAUSSIANS, CAMERA),
         "random": lambda: initial_points(scene.train, "random", count=50),
-        "dense": lambda: initial_points(scene.train, "dense", count=50),
         "sift": lambda: initial_points(scene.train, "sift", count=50),
         "file": lambda: initial_points(scene.train, "file", file=tmp_path / "cloud.ply"),
         "Trainer": lambda: trained(scene, points),

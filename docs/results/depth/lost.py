@@ -14,8 +14,8 @@ from kgs.bench.scenes import check_scenes
 from kgs.datasets import load_scene
 from kgs.fit.config import FitConfig
 from kgs.fit.run import fit_scene
-from kgs.geometry.cameras import to
-from kgs.geometry.multiview import nearest_pixels
+from kgs.geometry.cameras import project, to
+from kgs.geometry.multiview import nearest_pixels, unproject
 from kgs.init_points.agreement import consistent_pixels
 from kgs.init_points.dense import agreed_depths
 
@@ -104,8 +104,8 @@ def _kinds(
     kinds = torch.zeros(depths.shape, dtype=torch.long)
     rows, columns = (depths > 0).nonzero().unbind(1)
     own = to(cameras, "cpu", torch.float64)
-    points = own.unproject(torch.stack([columns, rows], 1), depths[rows, columns].double(), torch.full_like(rows, view))
-    pixels, there = training.project(points)
+    points = unproject(own, torch.stack([columns, rows], 1), depths[rows, columns].double(), torch.full_like(rows, view))
+    pixels, there = project(training, points)
     seen = torch.zeros(len(points), dtype=torch.long)
     agreed = torch.zeros(len(points), dtype=torch.bool)
     right = agreed.clone()
