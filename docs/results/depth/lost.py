@@ -104,7 +104,9 @@ def _kinds(
     kinds = torch.zeros(depths.shape, dtype=torch.long)
     rows, columns = (depths > 0).nonzero().unbind(1)
     own = to(cameras, "cpu", torch.float64)
-    points = unproject(own, torch.stack([columns, rows], 1), depths[rows, columns].double(), torch.full_like(rows, view))
+    points = unproject(
+        own, torch.stack([columns, rows], 1), depths[rows, columns].double(), torch.full_like(rows, view)
+    )
     pixels, there = project(training, points)
     seen = torch.zeros(len(points), dtype=torch.long)
     agreed = torch.zeros(len(points), dtype=torch.bool)
