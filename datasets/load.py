@@ -323,10 +323,10 @@ def _views(
     views = []
     for j, scale in enumerate(scales):
         opaque = torch.ones(1, *scale.size, dtype=torch.float32)
-        mask = torch.stack([alphas[j].get(i, opaque) for i in range(count)]) if alphas[j] else None
+        alpha = torch.stack([alphas[j].get(i, opaque) for i in range(count)]) if alphas[j] else None
         every = opaque[0] > 0
-        rows = torch.stack([valid[j].get(i, every) for i in range(count)]) if valid[j] else None
+        valid_mask = torch.stack([valid[j].get(i, every) for i in range(count)]) if valid[j] else None
         cameras = pinhole_cameras(extrinsics, intrinsics[j], *scale.size[::-1])
-        kinds = tuple(turned) if any(turned) else None
-        views.append(Views(cameras, images[j], names, mask, valid_mask=rows, turned=kinds))
+        turns = tuple(turned) if any(turned) else None
+        views.append(Views(cameras, images[j], names, alpha, valid_mask=valid_mask, turned=turns))
     return views

@@ -1,4 +1,4 @@
-"""What `kgs fit` does, in its order: scene, initial points, training, files, page; then all is published."""
+"""What `kgs fit` does with a scene, in its order: training, files, page; then all is published."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -184,7 +184,7 @@ def _settings(trainer: Trainer, request: SceneRequest) -> dict[str, Any]:
 def _write_results(
     fit: Fit, folder: Path, request: SceneRequest, lpips: Lpips | None, held_out: dict[str, Any] | None
 ) -> Fit:
-    """Write all files but the page; returns the fit with its metrics."""
+    """Write splat, exports, pictures and measures; returns the fit with its metrics."""
     scene = fit.scene
     names = png_names([*scene.train.names, *scene.test.names])
     save_ply(folder / "splat.ply", fit.model, offset=scene.offset)

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from kgs.datasets.source import SceneSource
@@ -13,13 +12,13 @@ from kgs.metrics.lpips import Lpips
 from .scene_request import SceneRequest
 from .training import Training
 
-MIN_PHOTOS = 4  # three to fit, and one to measure
+MIN_TO_MEASURE = 4  # three to fit, and one to measure
 
 
 def measure_held_out(
     request: SceneRequest,
     source: SceneSource,
-    photos: int,
+    count: int,
     config: FitConfig,
     lpips: Lpips | None = None,
     say: Callable[[str], None] | None = None,
@@ -29,7 +28,7 @@ def measure_held_out(
     Args:
         request: how the scene is loaded; all photos are training views.
         source: the folder of a scene whose cameras kgs found.
-        photos: how many it has, at least `MIN_PHOTOS`.
+        count: how many photos it has, at least `MIN_TO_MEASURE`.
         config: the settings of the fit of all photos, which are those of this fit.
         lpips: the perceptual metric, or None to leave it out.
         say: gets the notes of the fit.
@@ -38,7 +37,8 @@ def measure_held_out(
         The measures of the photo, as "test" in metrics.json has them, and the number of the signal that ended the
         training, or 0.
     """
-    scene = replace(request, hold_out=photos).load(Path(source.root), None, source)
+    held_out = replace(request, hold_out=count)  # of so many the one in the middle; the offset follows the others
+    scene = held_out.load(source.root, None, source)
     training = Training(title="measurement")
     _, fit = training.fit(scene, replace(config, evaluations=1))
     if say is not None:

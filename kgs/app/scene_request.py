@@ -29,7 +29,7 @@ class SceneRequest:
         hold_out: every Nth photo is for testing; 0: none; None: what the scene's files say.
         background: "black" or "white".
         points: "none", or "model-points".
-        photos: whether the page shows photos.
+        photos: whether the page shows photos; all are loaded.
         roll: degrees by which page and film are turned clockwise.
         title: of the page; "": the name of the folder.
         photo_folder: name of the folder of photos, as "images_8"; "": that of the largest.
@@ -54,7 +54,7 @@ class SceneRequest:
         """Load the scene.
 
         Args:
-            base: the folder that a relative path starts from.
+            base: the folder that a relative path starts from; of no use with `source`.
             say: gets the loader's notes.
             source: the folder of the scene where it is open already.
         """

@@ -85,7 +85,7 @@ def test_strays_move_nothing_else(cameras: Any, distances: tuple[float, ...]) ->
     shown = gaussians_of(packed)
     gone = 0 if max(distances) < 1e6 else len(distances)
     assert len(shown) == 300 - gone
-    assert packed.left_out == ["", "all but 1 stray Gaussian", "all but 2 stray Gaussians"][gone]
+    assert packed.reduced == ["", "all but 1 stray Gaussian", "all but 2 stray Gaussians"][gone]
     rest = exact[torch.arange(len(distances), 300)]
     found = shown[nearest(rest, shown)]
     assert largest_shift(rest, found, cameras) < PIXEL_ERROR
@@ -136,12 +136,12 @@ def test_few_gaussians_and_degenerate_ones(cameras: Any, count: int) -> None:
 def test_a_limit_costs_bits_then_harmonics_then_the_least_gaussians(cameras: Any) -> None:
     exact = random_gaussians(400, 3, sh_degree=2)
     whole = pack(exact, cameras, 10**7)
-    assert whole.left_out == ""
+    assert whole.reduced == ""
     sizes, words = [], []
     for maximum in (len(whole.content) - 1, len(whole.content) // 2, 3000):
         packed = pack(exact, cameras, maximum, lambda: torch.arange(400.0))
         sizes.append(len(packed.content))
-        words.append(packed.left_out)
+        words.append(packed.reduced)
         assert sizes[-1] <= maximum
     assert words[0] == "8-bit numbers"
     assert words[1].startswith("8-bit numbers, harmonics up to degree ")

@@ -118,12 +118,12 @@ def fit(
     if views is not None and views < 1:
         raise ArgumentError("views", "a whole number of at least 1", views)
     check_roll(roll)
-    check_size(size, downscale, source.scene is None)
+    check_size(size, downscale, source.is_unposed)
     check_options(downscale, hold_out)
     check_frames(frames, source)
     if lpips_weights is not None:
         weight_files(lpips_weights)
-    with Results.open(out, "fit", ["photos"] if source.scene is None else [], resume) as results:
+    with Results.open(out, "fit", ["photos"] if source.is_unposed else [], resume) as results:
         shortest = min_side(config, lpips_weights is not None)
         check_photos(source, views, hold_out, size, downscale, frames, shortest)
         check_init(config.init, source)

@@ -38,7 +38,7 @@ def poses(
     from kgs.app.sfm.source import Source
 
     source = Source.open(photos)
-    if source.scene is not None:
+    if not source.is_unposed:
         raise DataError(photos, "", "photos without camera poses", "a scene", advice="kgs fit takes it as it is")
     check_frames(frames, source)
     check_installed("pycolmap")

@@ -54,7 +54,7 @@ def run_fit(
 
     from kgs._support.machine import device_name
     from kgs.app.fit_folder import fit_folder
-    from kgs.app.held_out import MIN_PHOTOS, measure_held_out
+    from kgs.app.held_out import MIN_TO_MEASURE, measure_held_out
     from kgs.app.stages import Stages
     from kgs.init_points.files import read_points
     from kgs.metrics.lpips import Lpips
@@ -64,7 +64,7 @@ def run_fit(
             read_points(config.init_file)  # an error now, not once there are cameras
     lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(config.device)
     say(f"device: {device_name(torch.device(config.device))}")
-    stages = Stages(say_on_terminal, source.scene is None, measure)
+    stages = Stages(say_on_terminal, source.is_unposed, measure)
     if source.scene is None:
         stages.begin("cameras")
         assert not isinstance(size, str)  # refused before
@@ -77,10 +77,10 @@ def run_fit(
     height, width = scene.train.images.shape[-2:]
     kept = f"{quantity(len(scene.train), 'training photo')} of {width}x{height}"
     say(f"{printable(source.path)}: {kept}, {len(scene.test) or 'none'} held out")
-    with on_ctrl_c("the cameras that were found are kept" if source.scene is None else ""):
+    with on_ctrl_c("the cameras that were found are kept" if source.is_unposed else ""):
         held_out: dict[str, Any] = {}
-        if measure and len(scene.train) < MIN_PHOTOS:
-            say(f"other views are not measured: --measure needs at least {MIN_PHOTOS} photos")
+        if measure and len(scene.train) < MIN_TO_MEASURE:
+            say(f"other views are not measured: --measure needs at least {MIN_TO_MEASURE} photos")
         elif measure:
             stages.begin("measurement")
             held_out, signal = measure_held_out(request, scene_source, len(scene.train), config, lpips, say)

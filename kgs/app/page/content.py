@@ -1,4 +1,4 @@
-"""What a page shows, in the four parts that :func:`kgs.app.page.write_page` takes together."""
+"""What a page shows, in the three parts that :func:`kgs.app.page.write_page` takes together."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field

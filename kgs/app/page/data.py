@@ -57,13 +57,13 @@ class Packed(NamedTuple):
         layout: what a viewer needs to decode the content: `count`, `degree` of the harmonics, and `columns` with the
             name, width, low and step of each.
         content: the planes of all columns as one gzip file.
-        left_out: strays that were left out, and what was reduced to respect the limit of size, in words that follow "it
+        reduced: strays that were left out, and what was reduced to respect the limit of size, in words that follow "it
             shows"; "" for nothing.
     """
 
     layout: dict[str, Any]
     content: bytes
-    left_out: str = ""
+    reduced: str = ""
 
 
 class Column(NamedTuple):
@@ -118,7 +118,7 @@ def pack(
     reductions = list[str]()
     for packed, reductions in _with_all_gaussians(values, cameras, near_plane, degree):
         if len(packed.content) <= max_bytes:
-            return packed._replace(left_out=", ".join(words + reductions))
+            return packed._replace(reduced=", ".join(words + reductions))
     contributions = _opacity_times_area(values) if weights is None else weights().detach().cpu().double().numpy()[rows]
     order = np.argsort(-contributions, kind="stable")
     count = len(rows)
@@ -129,7 +129,7 @@ def pack(
         chosen = {name: value[order[:count]] for name, value in values.items()}
         packed = _gzip(_compressed_columns(chosen, cameras, near_plane, COARSE, 0), 0)
     words += [*reductions, f"{count} of {len(rows)} Gaussians"]
-    return packed._replace(left_out=", ".join(words))
+    return packed._replace(reduced=", ".join(words))
 
 
 def _visible(gaussians: Gaussians) -> tuple[dict[str, NDArray[Any]], NDArray[np.intp]]:

@@ -63,7 +63,7 @@ def write_page(path: Path, content: PageContent, max_bytes: int = MAX_BYTES) -> 
     )
     size = len(page.html(packed))
     write_whole(path, page.html(packed, size))
-    return packed.left_out
+    return packed.reduced
 
 
 class _Page:
@@ -118,7 +118,7 @@ class _Page:
             content = base64.b64encode(packed.content).decode()
             splat = {"layout": packed.layout, "content": content}
             words = {
-                "reduced": packed.left_out,
+                "reduced": packed.reduced,
                 "scene_size": f"{packed.layout['count']} Gaussians in {_megabytes(len(content))}",
                 "page_size": _megabytes(page_bytes),
             }

@@ -1,4 +1,4 @@
-"""What a command is given to read: photos, a video, or a scene with camera poses; looked at once."""
+"""What a command is given to read: photos, a video, or a scene with camera poses; whose kind is found once."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,6 +40,11 @@ class Source:
         if video := find_video(path):
             return cls(path, video=video)
         return cls(path, photos=tuple(find_photos(path)))
+
+    @property
+    def is_unposed(self) -> bool:
+        """Whether its cameras are to be found."""
+        return self.scene is None
 
     @property
     def has_kgs_cameras(self) -> bool:
