@@ -14,9 +14,10 @@ from compositing_checks import (
     random,
     sample,
 )
+from refusals import refused
 from targets import SELDOM_INTERPRETED, TORCH, Target
 
-from kgs import RasterOptions, composite
+from kgs import ArgumentError, RasterOptions, composite
 from kgs.backends.gpu import compositing
 
 

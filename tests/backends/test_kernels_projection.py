@@ -18,10 +18,11 @@ from factories import (
 )
 from kornia.sensors.camera import CameraModelType
 from projection_checks import DIFFERENTIABLE, list_and_gradients, wide_scene
+from refusals import refused
 from targets import COMPILED, SELDOM_INTERPRETED, TORCH
 
 import kgs
-from kgs import GaussianRenderer, Gaussians, RasterOptions, composite, project
+from kgs import ArgumentError, GaussianRenderer, Gaussians, RasterOptions, composite, project
 from kgs.harmonics import SH_C0
 
 

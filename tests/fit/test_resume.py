@@ -123,11 +123,8 @@ TENSORS = [
     ("intrinsics", nudged, "intrinsics"),
 ]
 OTHER_SCENES = [
-    (
-        f"{said} of the {part} views",
-        lambda scene, part=part, name=name, change=change: changed(scene, part, name, change),
-    )
-    for part in ("training", "test")
+    (f"{said} of the {part} views", lambda scene, group=group, change={name: change}: changed(scene, group, **change))
+    for group, part in (("train", "training"), ("test", "test"))
     for name, change, said in TENSORS
 ]
 OTHER_SCENES += [
