@@ -7,12 +7,17 @@ import weakref
 import pytest
 import torch
 from factories import FIELDS, batch, leaves, random_camera, random_gaussians
+<<<<<<< HEAD
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from refusals import refused
 
 import kgs
 import kgs.reference
 from kgs import ArgumentError, GaussianRenderer, rasterization
+=======
+
+from kgs import GaussianRenderer, rasterization
+>>>>>>> main
 
 pytestmark = pytest.mark.usefixtures("each_backend")
 
@@ -95,7 +100,8 @@ REFUSED = {
     "with_eval3d": [True],
     "global_z_order": [False],
     "rays": [torch.zeros(2, 24, 32, 6)],
-    "extra_signals": [torch.zeros(59, 2).double()],
+    "extra_signals": [torch.zeros(60, 2).double()],
+    "return_normals": [True],
     "extra_signals_sh_degree": [3],
     "viewmats_rs": [torch.eye(4).expand(2, 4, 4)],
     "rolling_shutter": [RollingShutter.ROLLING_TOP_TO_BOTTOM],
@@ -105,7 +111,7 @@ REFUSED = {
     "sh_degree": [4, 0],
     "colors": [torch.zeros(59, 3).double(), torch.zeros(3, 60, 3).double()],
     "backgrounds": [torch.zeros(2, 4).double()],
-    "means": [torch.zeros(0, 60, 3).double(), torch.zeros(60, 2).double()],
+    "means": [torch.zeros(2, 60, 3).double(), torch.zeros(60, 2).double(), torch.tensor(1.0).double()],
     "viewmats": [
         torch.eye(4).double(),
         torch.eye(4).double().expand(0, 4, 4),
@@ -126,6 +132,13 @@ def test_what_kgs_does_not_do_is_an_error_that_names_the_argument(name, value):
     named = "colors" if (name, value) == ("sh_degree", 0) else name
     with refused(ArgumentError, name=named):
         call(gaussians, cameras, **{name: value})
+
+
+@pytest.mark.usefixtures("torch_alone")
+def test_harmonics_through_an_orthographic_lens_are_refused():
+    """gsplat takes their directions from the camera's centre, kgs along the rays."""
+    with pytest.raises(ValueError, match="^sh_degree:"):
+        call(*scene(sh_degree=1), sh_degree=1, camera_model="ortho")
 
 
 @pytest.mark.usefixtures("torch_alone")
@@ -192,6 +205,7 @@ def test_the_dense_layout_says_what_the_packed_one_does():
 
 @pytest.mark.parametrize("packed", [True, False])
 @pytest.mark.parametrize("sh_degree", [None, 1])
+<<<<<<< HEAD
 def test_leading_dimensions_are_scenes_of_their_own(packed, sh_degree):
     """Two by three scenes at once, and each alone: images, gradients and what meta says."""
     scenes = [(random_gaussians(20, b, torch.float32, sh_degree, 32), b) for b in range(6)]
@@ -279,30 +293,32 @@ def test_normals_are_third_axes_towards_the_camera(exactly):
 @pytest.mark.parametrize("packed", [True, False])
 @pytest.mark.parametrize(("shape", "sh_degree"), [((), None), ((2,), 1), ((2, 3), None)])
 def test_no_gaussians_and_none_seen(packed, shape, sh_degree):
+=======
+def test_no_gaussians_and_none_seen(packed, sh_degree):
+>>>>>>> main
     cameras = batch(*(random_camera(*SIZE, seed, torch.float32) for seed in range(2)))
-    views = [x.expand(*shape, *x.shape) for x in (cameras.extrinsics, cameras.intrinsics[:, :3, :3])]
+    views = (cameras.extrinsics, cameras.intrinsics[:, :3, :3])
     for n in (0, 4):  # the four lie behind the cameras
-        values = [torch.rand(*shape, n, width) for width in (3, 4, 3)]
+        values = [torch.rand(n, width) for width in (3, 4, 3)]
         values[0][..., 2] -= 9.0
-        values += [torch.rand(*shape, n), torch.rand(*shape, n, *((3,) if sh_degree is None else (4, 3)))]
+        values += [torch.rand(n), torch.rand(n, *((3,) if sh_degree is None else (4, 3)))]
         leaves = [x.requires_grad_() for x in values]
         options = {"sh_degree": sh_degree, "packed": packed, "absgrad": True, "render_mode": "RGB+ED"}
         renders, alphas, meta = rasterization(*leaves, *views, 32, 24, **options)
-        assert renders.shape == (*shape, 2, 24, 32, 4)
+        assert renders.shape == (2, 24, 32, 4)
         assert not renders.any()
         assert not alphas.any()
-        assert meta["means2d"].shape == ((0, 2) if packed else (*shape, 2, n, 2))
+        assert meta["means2d"].shape == ((0, 2) if packed else (2, n, 2))
         if n:
             renders.sum().backward()
             assert not any(x.grad is not None and x.grad.any() for x in leaves)
 
 
-def test_features_of_no_width_in_a_batch():
+@pytest.mark.parametrize("shape", [(60, 0), (2, 60, 0)])
+def test_features_of_no_width(shape):
     gaussians, cameras = scene(dtype=torch.float32)
-    values = {name: torch.stack([getattr(gaussians, name)] * 2) for name in FIELDS} | {"colors": torch.zeros(2, 60, 0)}
-    views = {"viewmats": torch.stack([cameras.extrinsics] * 2), "Ks": torch.stack([cameras.intrinsics[:, :3, :3]] * 2)}
-    renders, _, _ = rasterization(**values, **views, width=32, height=24, render_mode="RGB+D")
-    assert renders.shape == (2, 2, 24, 32, 1)
+    renders, _, _ = call(gaussians, cameras, colors=torch.zeros(shape), render_mode="RGB+D")
+    assert renders.shape == (2, 24, 32, 1)
 
 
 @pytest.mark.parametrize("packed", [True, False])
