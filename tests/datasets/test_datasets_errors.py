@@ -1,14 +1,9 @@
 """What the readers of scenes and the synthetic room refuse: the name of the argument."""
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
 from factories import pinhole
-from kornia.geometry.camera import PinholeCamera
 from refusals import refused
 from tiny_scenes import write_llff
 
@@ -20,56 +15,56 @@ from kgs.datasets.splits import select_evenly
 from kgs.datasets.synthetic import synthetic_depths
 from kgs.datasets.synthetic.raycast import raycast
 
-LOADED = {
-    "background": ("green",),
-    "points": ("dense",),
-    "downscale": (0, 0.5, float("nan"), float("inf"), "2"),
-    "hold_out": (1, -1, 2.5, True, "3"),
-    "train_views": (0, 10, -1),
-}
-OF_ROOM = {"train_views": 0, "test_views": -1, "size": (0, 8)}
+
+def each(name, call, *values):
+    """A case for each of these values."""
+    return [(name, lambda root, value=value: call(root, value)) for value in values]
 
 
-def loaded(root: Path, name: str, value: object) -> None:
-    write_llff(root, 11)
-    arguments: dict[str, Any] = {name: value}
-    load_scene(root, **arguments)
+def of_scene(name, *values):
+    def load(root, value):
+        write_llff(root, 11)
+        load_scene(root, **{name: value})
+
+    return each(name, load, *values)
 
 
-def of_one_row() -> Views:
-    cameras = pinhole(1, 8, 30.0, dtype=torch.float32)
-    return Views(cameras, torch.zeros(1, 3, 1, 8), ("a",), torch.ones(1, 1, 1, 8))
+def of_room(name, value):
+    return name, lambda _: synthetic_scene(**{name: value})
 
 
-def cameras_of_two_sizes() -> PinholeCamera:
-    cameras = pinhole(12, 16, 20.0, dtype=torch.float32, cameras=2)
-    cameras.height = torch.tensor([12.0, 13.0])
-    return cameras
+def distorted(_, first):
+    rectification(Intrinsics(120, 90, 100, 98, 58, 47, (first, 0, 0, 0)))
 
 
-def room(**arguments: Any) -> None:
-    synthetic_scene(**arguments)
+def halved_row(_):
+    Views(pinhole(1, 8, 30.0), torch.zeros(1, 3, 1, 8), ("a",), None).downsample(2)
 
 
-CASES: list[tuple[str, Callable[[Path], object]]] = [
-    *[
-        (name, lambda root, name=name, value=value: loaded(root, name, value))
-        for name, values in LOADED.items()
-        for value in values
-    ],
-    *[("train_views", lambda _, views=views: select_evenly(17, views)) for views in (0, -1, 18, True, 2.0, "3")],
-    *[(name, lambda _, name=name, value=value: room(**{name: value})) for name, value in OF_ROOM.items()],
-    ("images", lambda _: of_one_row().downsample(2)),
-    ("cameras", lambda _: synthetic_depths(cameras_of_two_sizes())),
+def depths_of_two_sizes(_):
+    cameras = pinhole(12, 16, 20.0, cameras=2)
+    cameras.height[1] = 64.0
+    synthetic_depths(cameras)
+
+
+CASES = [
+    *of_scene("background", "green"),
+    *of_scene("points", "dense"),
+    *of_scene("downscale", 0, 0.5, float("nan"), float("inf"), "2"),
+    *of_scene("hold_out", 1, -1, 2.5, True, "3"),
+    *of_scene("train_views", 0, 10, -1),
+    *each("train_views", lambda _, views: select_evenly(17, views), 0, -1, 18, True, 2.0, "3"),
+    of_room("train_views", 0),
+    of_room("test_views", -1),
+    of_room("size", (0, 8)),
+    ("images", halved_row),
+    ("cameras", depths_of_two_sizes),
     ("triangles", lambda _: raycast(np.zeros((3, 3)), np.eye(3), np.eye(4), (2, 2))),
-    *[
-        ("distortion", lambda _, first=first: rectification(Intrinsics(120, 90, 100, 98, 58, 47, (first, 0, 0, 0))))
-        for first in (-3.0, 40.0)
-    ],
+    *each("distortion", distorted, -3.0, 40.0),
 ]
 
 
 @pytest.mark.parametrize(("name", "call"), CASES)
-def test_what_is_wrong_is_named(tmp_path: Path, name: str, call: Callable[[Path], object]) -> None:
+def test_what_is_wrong_is_named(tmp_path, name, call):
     with refused(ArgumentError, name=name):
         call(tmp_path)
