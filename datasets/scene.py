@@ -13,11 +13,7 @@ from torch.nn.functional import avg_pool2d
 
 from kgs._support.errors import ArgumentError, DataError
 from kgs._support.shown import ShownByShapes
-
-
-def pinholes(intrinsics: Tensor, extrinsics: Tensor, size: tuple[int, int]) -> PinholeCamera:
-    """Cameras from `(V, 4, 4)` matrices and one (height, width) for all of them."""
-    return PinholeCamera(intrinsics, extrinsics, *(intrinsics.new_full((len(intrinsics),), float(s)) for s in size))
+from kgs.geometry.cameras import resized, select
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -79,14 +75,17 @@ class Views(ShownByShapes):
         if not bool(((self.cameras.height == height) & (self.cameras.width == width)).all()):
             sizes = [self.cameras.height.tolist(), self.cameras.width.tolist()]
             raise ArgumentError("cameras", f"height {height} and width {width} as images", sizes)
-        if self.alphas is not None and tuple(self.alphas.shape) != (count, 1, height, width):
-            raise ArgumentError("alphas", f"shape ({count}, 1, {height}, {width})", tuple(self.alphas.shape))
-        if self.border_mask is not None and tuple(self.border_mask.shape) != (height, width):
-            raise ArgumentError("border_mask", f"shape ({height}, {width})", tuple(self.border_mask.shape))
-        if self.valid_mask is not None and tuple(self.valid_mask.shape) != (count, height, width):
-            raise ArgumentError("valid_mask", f"shape ({count}, {height}, {width})", tuple(self.valid_mask.shape))
-        if self.gains is not None and (tuple(self.gains.shape) != (count, 3) or not bool((self.gains > 0).all())):
-            raise ArgumentError("gains", f"numbers above 0 of shape ({count}, 3)", self.gains.tolist())
+        shapes = {
+            "alphas": (count, 1, height, width),
+            "border_mask": (height, width),
+            "valid_mask": (count, height, width),
+            "gains": (count, 3),
+        }
+        for name, shape in shapes.items():
+            if (value := getattr(self, name)) is not None and tuple(value.shape) != shape:
+                raise ArgumentError(name, f"shape {shape}", tuple(value.shape))
+        if self.gains is not None and not bool((self.gains > 0).all()):
+            raise ArgumentError("gains", "numbers above 0", self.gains.tolist())
         if self.turned is not None and len(self.turned) != count:
             raise ArgumentError("turned", f"{count} as names", len(self.turned))
 
@@ -117,37 +116,20 @@ class Views(ShownByShapes):
 
         TypeError for positions that are not integers, IndexError for views that do not exist.
         """
-        rows = index if isinstance(index, Tensor) else torch.as_tensor(index, device="cpu")
-        if rows.numel() and (rows.is_floating_point() or rows.is_complex() or rows.dtype == torch.bool):
-            raise TypeError(f"index: expected integers, got {rows.dtype}")
-        rows = rows.reshape(-1).long()
-        if not bool(((rows >= -len(self)) & (rows < len(self))).all()):
-            raise IndexError(
-                f"index: expected whole numbers below {len(self)}, the number of views, got {rows.tolist()}"
-            )
-        rows = rows.to(self.cameras.extrinsics.device)
-        cameras = self.cameras
-        return PinholeCamera(
-            cameras.intrinsics[rows], cameras.extrinsics[rows], cameras.height[rows], cameras.width[rows]
-        )
+        return select(self.cameras, index)
 
     def select(self, indices: Sequence[int]) -> Self:
         """The views at the given positions, in that order."""
         rows = torch.tensor(indices, dtype=torch.int64, device="cpu")
-        alphas = None if self.alphas is None else self.alphas[rows]
-        valid_mask = None if self.valid_mask is None else self.valid_mask[rows]
-        names = tuple(self.names[i] for i in indices)
-        turned = None if self.turned is None else tuple(self.turned[i] for i in indices)
-        gains = None if self.gains is None else self.gains[rows]
         return replace(
             self,
             cameras=self.camera(rows),
             images=self.images[rows],
-            names=names,
-            alphas=alphas,
-            valid_mask=valid_mask,
-            turned=turned,
-            gains=gains,
+            names=tuple(self.names[i] for i in indices),
+            alphas=None if self.alphas is None else self.alphas[rows],
+            valid_mask=None if self.valid_mask is None else self.valid_mask[rows],
+            gains=None if self.gains is None else self.gains[rows],
+            turned=None if self.turned is None else tuple(self.turned[i] for i in indices),
         )
 
     def render(self, index: int, render: Callable[..., Tensor]) -> Tensor:
@@ -196,12 +178,9 @@ class Views(ShownByShapes):
         if 0 in size:
             given = tuple(self.images.shape[-2:])
             raise ArgumentError("images", f"at least {factor} x {factor} pixels to downsample", given)
-        intrinsics = self.cameras.intrinsics.clone()
-        intrinsics[:, :2, :3] /= factor
-        intrinsics[:, :2, 2] += 0.5 / factor - 0.5  # (c + 1/2) / factor - 1/2: pixel centres are integers
         return replace(
             self,
-            cameras=pinholes(intrinsics, self.cameras.extrinsics, size),
+            cameras=resized(self.cameras, 1 / factor, size),
             images=avg_pool2d(self.images, factor),
             alphas=None if self.alphas is None else avg_pool2d(self.alphas, factor),
             border_mask=None if self.border_mask is None else avg_pool2d(self.border_mask[None], factor)[0],

@@ -25,7 +25,7 @@ from refusals import refused
 
 from kgs import ArgumentError
 from kgs.app.console import each
-from kgs.geometry import typical_depths
+from kgs.geometry.multiview import typical_depths
 from kgs.init_points import initial_points
 
 
