@@ -28,8 +28,8 @@ class GaussianRenderer(nn.Module):
 
     Limits:
         Differentiable once, by `backward` or `torch.autograd.grad`. Second derivatives, forward mode, `torch.func`
-        (vmap, jacrev, jvp, ...) and `is_grads_batched` are errors. `torch.compile` breaks its graph at `project` and
-        `composite`, which run as they are. Depth divides by alpha = 1 - T, which in float32 has an error of 6e-8: 6 %
+        (vmap, jacrev, jvp, ...) and `is_grads_batched` are errors. `torch.compile` breaks its graph at the
+        renderer, which runs as it is. Depth divides by alpha = 1 - T, which in float32 has an error of 6e-8: 6 %
         where alpha is 1e-6.
 
     Args:

@@ -84,6 +84,7 @@ def project(
     return with_options(chosen.project(gaussians, cameras, size, options, colors), options)
 
 
+@outside_graphs
 def composite(
     projected: ProjectedGaussians,
     features: Tensor,
@@ -207,7 +208,7 @@ def _check_projected(projected: ProjectedGaussians, features: Tensor) -> None:
         raise TypeError(f"camera_ids: expected int64 on {like.device}, got {ids.dtype} on {ids.device}")
     if tuple(ids.shape) != (m,):
         raise ArgumentError("camera_ids", f"shape {(m,)}", tuple(ids.shape))
-    if m and ids.device.type == "cpu" and not torch.compiler.is_compiling():  # on a GPU this would synchronise
+    if m and ids.device.type == "cpu":  # on a GPU this would synchronise
         first = int(np.min(ids.numpy()))
         last = int(np.max(ids.numpy()))
         if first < 0 or last >= projected.num_cameras:

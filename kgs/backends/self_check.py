@@ -96,7 +96,7 @@ def _random(*shape: int, low: float = -1.0, high: float = 1.0, seed: int = 0) ->
 
 def _dtype(backend: Backend) -> torch.dtype:
     """Float64 of torch, which defines what is right."""
-    return torch.float64 if backend is TORCH else torch.float32
+    return torch.float64 if backend.name == TORCH.name else torch.float32
 
 
 def _activate(backend: Backend, device: torch.device, case: CheckCase) -> list[Tensor]:

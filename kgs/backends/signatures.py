@@ -32,8 +32,8 @@ class Project(Protocol):
     ) -> ProjectedGaussians:
         """Gaussians as all cameras see them, whose images have `size` (height, width).
 
-        `far_plane`, `radius_clip` and `antialiased` of the options are applied afterwards, by `kgs.stages`. `colors`
-        says whether colours are computed.
+        `far_plane`, `radius_clip` and `antialiased` of the options are applied afterwards, by `with_options` of
+        `kgs.geometry.projection`. `colors` says whether colours are computed.
         """
 
 

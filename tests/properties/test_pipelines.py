@@ -176,7 +176,7 @@ def rendered_fit(backend, seed):
 @pytest.mark.parametrize("seed", [None, 3])
 @pytest.mark.parametrize("backend", ["eager", "aot_eager", "inductor"])
 def test_a_compiled_step_with_the_renderer_is_the_step(backend, seed):
-    """`project` and `composite` run as they are, in the kernels too; the rest is compiled around them."""
+    """The renderer runs as it is, in the kernels too; the rest is compiled around it."""
     if backend == "inductor":
         skip_without_a_compiler()
     expected, eager = rendered_fit(None, seed)
