@@ -138,8 +138,8 @@ class FitConfig:
             points are dense. same: never.
         refine_poses: optimise the poses of the training cameras too, for poses that are half a degree or more off;
             accurate ones get slightly worse. Their mean and spread stay.
-        coarse: share of the steps, from the start, that use the training views at half the width; in [0, 1]. Unless
-            given: 0, and half of them for unposed photos at the size that kgs fit chooses.
+        coarse: half-resolution warm-up: share of the steps, from the start, that use the training views at half the
+            width; in [0, 1]. Unless given: 0, and half of them for unposed photos at the size that kgs fit chooses.
         seed: of everything random: initial points, order of views, backgrounds, splits and drop masks.
         init: kind of initial points. dense: points of depth maps, made from the training images by a plane sweep in
             some seconds per view. sift: points of matched keypoints. random: random points in the space that at least

@@ -11,7 +11,7 @@ from kgs._support.errors import ArgumentError
 
 @dataclass(frozen=True)
 class DegreeDecision:
-    """The degree of the harmonics, see :mod:`kgs.fit.view_dependence`.
+    """The degree of the harmonics, see :mod:`kgs.fit.sh_degree`.
 
     Args:
         chosen: the degree.

@@ -17,7 +17,7 @@ from .config import FitConfig, Settings
 from .decisions import Decisions
 from .exposure import decide_exposure
 from .overlap import FEW, decide_by_overlap, usual_decay
-from .view_dependence import decide_degree
+from .sh_degree import decide_degree
 
 
 class Schedule(NamedTuple):

@@ -1,4 +1,4 @@
-"""The poses of the training cameras as parameters of a fit, for poses that are only roughly known.
+"""Pose refinement: the poses of the training cameras as parameters of a fit, where they are only roughly known.
 
 Convention:
     World-to-camera extrinsics. A motion is six numbers in a camera's own frame, as of Kornia's `Se3`: a translation in
@@ -27,8 +27,8 @@ TRANSLATION = 0.3
 LAST = 0.01  # the last learning rate, relative to the first
 
 
-class MovingPoses:
-    """The poses of V cameras as a fit refines them; each step moves one of them a little.
+class CameraOptimizer:
+    """The optimizer of the poses of V cameras; each step moves one of them a little.
 
     The gauge is fixed: the mean rotation, the mean centre and the spread of the centres stay as given, so that neither
     the splat nor a test camera has to follow.

@@ -23,7 +23,7 @@ from kgs.model import PARAMETERS, GaussianModel
 from .adam import Adam
 from .config import Settings
 from .plan import Plan
-from .poses import MovingPoses
+from .poses import CameraOptimizer
 
 # for each parameter the name of its learning rate in the recipe, without `lr_`
 _LEARNING_RATES = dict(zip(PARAMETERS, ("means", "quats", "scales", "opacity", "sh_dc", "sh_rest"), strict=True))
@@ -73,7 +73,7 @@ class TrainState:
     drop: DropGaussian | None
     order: torch.Generator
     colors: torch.Generator
-    poses: MovingPoses | None
+    poses: CameraOptimizer | None
     step: int = 0
     seconds: float = 0.0
     stack: list[int] = field(default_factory=list)
@@ -126,7 +126,7 @@ class TrainState:
         )
         poses = None
         if config.refine_poses:
-            poses = MovingPoses(scene.train.cameras.extrinsics, plan.schedule.steps, start.depth)
+            poses = CameraOptimizer(scene.train.cameras.extrinsics, plan.schedule.steps, start.depth)
         return cls(
             start,
             model,

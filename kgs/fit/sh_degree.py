@@ -1,4 +1,4 @@
-"""Decides before a fit, from the photos alone, whether the colours of a scene depend on the direction.
+"""Selects the degree of the spherical harmonics before a fit: whether colours depend on the direction, by the photos.
 
 Dense initial points come with the colours of small patches of surface in the views that agree on their depth. Each of
 these colours is predicted from those of the other views: once as their mean, once by harmonics of degree 3, whose
