@@ -45,7 +45,7 @@ _PARTS = 200  # the search for the number to remove ends at a 200th of the candi
 
 @dataclass(frozen=True, eq=False)
 class Artifacts:
-    """Which Gaussians of a splat are oversized, elongated or floaters; one may be several.
+    """Which Gaussians of a splat are oversized, elongated or floaters. One may be several.
 
     Args:
         oversized: bool `(N,)`.
@@ -63,7 +63,7 @@ class Artifacts:
         return self.oversized | self.elongated | self.floaters
 
     def counts(self, rows: Tensor) -> dict[str, int]:
-        """How many of the Gaussians at `rows`, bool `(N,)`, are of each kind; one of several counts for the first."""
+        """How many of the Gaussians at `rows`, bool `(N,)`, are of each kind. One of several counts for the first."""
         found = dict[str, int]()
         for kind in KINDS:
             mask: Tensor = getattr(self, kind)
@@ -150,7 +150,7 @@ def find_artifacts(
 
 
 def clean(fit: Fit, strength: float = 1.0, bar: ProgressBar = silent) -> Cleaned:
-    """The fit without the floaters, oversized and elongated Gaussians that its training views do not need.
+    """The fit without the floaters, oversized and elongated Gaussians that its training views can spare.
 
     The candidates are those of :func:`find_artifacts`, in the order of how much a view changes without them: the
     squared change of its image over its squared error, in the view where that is largest. As many are removed, least
@@ -204,13 +204,13 @@ def check_strength(strength: float) -> None:
 
 
 def check_left(count: int) -> None:
-    """Raise a ValueError if no Gaussian is left."""
+    """Raise a ValueError unless a Gaussian is left."""
     if not count:
         raise ArgumentError("strength", "one at which a Gaussian is left", "one at which all are artifacts")
 
 
 def _median(values: Tensor) -> Tensor:
-    """The median of some numbers; 0 of none."""
+    """The median of some numbers, 0 without any."""
     return values.median() if len(values) else values.new_zeros(())
 
 
@@ -224,7 +224,7 @@ def _farther(means: Tensor) -> Tensor:
 
 
 def _spacing(means: Tensor) -> Tensor:
-    """The root mean squared distance to the three nearest centres, `(N,)`; 0 where there is no such thing."""
+    """The root mean squared distance to the three nearest centres, `(N,)`, or 0 of too few or equal centres."""
     if len(means) <= NEIGHBOURS or bool((means == means[0]).all()):
         return means.new_zeros(len(means))
     return log_spacing(means).exp()
@@ -259,7 +259,7 @@ def _near(means: Tensor, cameras: PinholeCamera, confirmed: Tensor, share: float
 
 
 def _changes(fit: Fit, rows: Tensor, levels: Sequence[float], bar: ProgressBar) -> Tensor:
-    """How much the image of a training view changes without each of the Gaussians at `rows`, bool `(N,)`; `(M,)`.
+    """How much the image of a training view changes without each of the M Gaussians at `rows`, bool `(N,)`.
 
     The largest over the views of the squared change, summed over the pixels that count, over the mean squared error of
     the view, which its PSNR gives: `levels`. An image is affine in the opacity of one Gaussian, so its change is the

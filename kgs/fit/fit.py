@@ -109,12 +109,12 @@ class Fit:
 
     @torch.no_grad()
     def median_depth(self, camera: PinholeCamera) -> Tensor:
-        """The median depth of the Gaussians from one camera, `(H, W)` on the CPU; 0 where there is nothing."""
+        """The median depth of the Gaussians from one camera, `(H, W)` on the CPU, 0 in the empty."""
         gaussians = self.model(backend=self.backend)
         rendering = self._renderer(gaussians, move_camera(camera, self.device), outputs=("median_depth",))
         depth: Tensor = rendering.median_depth[0, 0].cpu()
         return depth
 
     def psnr(self, views: Views) -> float | None:
-        """Mean PSNR of clamped renders over some views, in dB; None without views, or if one PSNR is infinite."""
+        """The mean PSNR of clamped renders over some views, in dB. Without views, or if one is infinite: None."""
         return mean_psnr(self.render, views)

@@ -46,7 +46,7 @@ def fit_scene(
     resume: str | PathLike[str] | None = None,
     hooks: Hooks = Hooks(),
 ) -> Fit:
-    """Fit a scene: initial points, plan, training, pruning. Nothing is written; `kgs fit` calls it and writes a folder.
+    """Fit a scene: initial points, plan, training, pruning. `kgs fit` calls it and writes a folder.
 
     Args:
         scene: posed training and test views; the test views are rendered only for the curve.
@@ -76,7 +76,7 @@ def fit_scene(
 
 
 def check_before_points(scene: Scene, config: FitConfig, lpips: bool = False) -> None:
-    """Check what needs no initial points, which can take a minute: device, backend, and the size of the images.
+    """Check device, backend and the size of the images, before initial points take a minute.
 
     Args:
         scene: the scene to fit.

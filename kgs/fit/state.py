@@ -144,7 +144,7 @@ class TrainState:
             self.notes.append(text)
 
     def to_dict(self) -> dict[str, Any]:
-        """The state as nested dicts of tensors and plain values, which are not copied."""
+        """The state as nested dicts of its own tensors and plain values."""
         parts = {
             "model": self.model.state_dict(),
             "optimizer": self.optimizer.state_dict(),

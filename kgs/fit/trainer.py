@@ -45,7 +45,7 @@ _LOOK = 20  # steps between limits of the scales, and on a GPU between looks for
 
 
 class Trainer:
-    """Fits Gaussians to the training views of a scene; the test views are rendered only for the curve.
+    """Fits Gaussians to the training views of a scene. The test views are rendered for the curve alone.
 
     Args:
         scene: posed training and test views, of at least 6x6 pixels, 12x12 with `coarse`.
@@ -84,7 +84,7 @@ class Trainer:
             self._use(TrainState.begin(exposed, plan, points), exposed)
 
     def _use(self, state: TrainState, scene: Scene) -> None:
-        """Train on from a state; the scene has the gains that were decided."""
+        """Train on from a state, on a scene with the gains that were decided."""
         config = self.plan.config
         self.state = state
         self.renderer = GaussianRenderer(
@@ -130,7 +130,7 @@ class Trainer:
         return self.result()
 
     def result(self) -> Fit:
-        """The fit as far as it is; its model is the one that is trained."""
+        """The fit as far as it is, with the model that is trained."""
         state = self.state
         return Fit(
             scene=self.scene,
@@ -150,7 +150,7 @@ class Trainer:
         )
 
     def train_step(self) -> float:
-        """One step and all that is due after it (curve, densification, reset of the opacities); returns the loss.
+        """The loss of one step, which is done with all that is due after it: curve, densification, reset of opacities.
 
         On a GPU the loss is that of the last of every 20 steps: reading a number waits until all work is done.
 
@@ -200,7 +200,7 @@ class Trainer:
         return self.result().render(camera)
 
     def psnr(self, views: Views) -> float | None:
-        """Mean PSNR of clamped renders over some views, in dB; None without views, or if one PSNR is infinite."""
+        """The mean PSNR over some views, see :meth:`Fit.psnr`."""
         return self.result().psnr(views)
 
     def state_dict(self) -> dict[str, Any]:
@@ -240,7 +240,7 @@ class Trainer:
         self._use(state, exposed)
 
     def save(self, path: str | PathLike[str], part: dict[str, Any] | None = None) -> None:
-        """Write a checkpoint; after an OSError one that was there is still there.
+        """Write a checkpoint. After an OSError one that was there is still there.
 
         Args:
             path: the file to write.
@@ -285,7 +285,7 @@ class Trainer:
         return trainer
 
     def _optimize(self) -> float:
-        """Render a training view, compare it with its photo, and move the parameters; returns the loss."""
+        """The loss of a training view, by whose gradients the parameters are moved."""
         state = self.state
         config = self.plan.config
         steps = self.plan.schedule.steps
