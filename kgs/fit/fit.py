@@ -92,7 +92,7 @@ class Fit:
 
     @torch.no_grad()
     def render_with_depth(self, camera: PinholeCamera, gains: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """What :meth:`render` and :meth:`median_depth` return, in one render."""
+        """What :meth:`render` returns, and the median depth of the Gaussians, `(H, W)` on the CPU, 0 in the empty."""
         image, rendering = self._render(camera, gains, "median_depth")
         return image, rendering.median_depth[0, 0].cpu()
 
@@ -106,14 +106,6 @@ class Fit:
             return rendering.image, rendering
         exposed = rendering.image * gains.to(rendering.image)[:, None, None]
         return blend(exposed, 1.0 - rendering.alpha, self._background, self.backend), rendering
-
-    @torch.no_grad()
-    def median_depth(self, camera: PinholeCamera) -> Tensor:
-        """The median depth of the Gaussians from one camera, `(H, W)` on the CPU, 0 in the empty."""
-        gaussians = self.model(backend=self.backend)
-        rendering = self._renderer(gaussians, move_camera(camera, self.device), outputs=("median_depth",))
-        depth: Tensor = rendering.median_depth[0, 0].cpu()
-        return depth
 
     def psnr(self, views: Views) -> float | None:
         """The mean PSNR of clamped renders over some views, in dB. Without views, or if one is infinite: None."""

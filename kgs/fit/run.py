@@ -33,9 +33,9 @@ class Hooks:
 
     bar: ProgressBar = silent
     make_trainer: Callable[[Scene, Plan, InitialPoints], Trainer] = Trainer
-    begun: Callable[[Trainer], None] | None = None
+    begun: Callable[[Trainer], object] = lambda _: None
     after_step: Callable[[Trainer, float], bool] | None = None
-    done: Callable[[Trainer, Fit], None] | None = None
+    done: Callable[[Trainer, Fit], object] = lambda *_: None
 
 
 def fit_scene(
@@ -67,11 +67,9 @@ def fit_scene(
         check_before_points(scene, config)
         points = choose_points(scene, config, hooks.bar) if points is None else points
         trainer = hooks.make_trainer(scene, make_plan(scene, config, points), points)
-    if hooks.begun is not None:
-        hooks.begun(trainer)
+    hooks.begun(trainer)
     fit = prune(trainer.fit(hooks.after_step))
-    if hooks.done is not None:
-        hooks.done(trainer, fit)
+    hooks.done(trainer, fit)
     return fit
 
 

@@ -22,7 +22,7 @@ from torch import Tensor
 from kgs._support.errors import ArgumentError, TrainingDiverged
 from kgs._support.torch_threads import threads_beside
 from kgs.backends import BACKENDS, resolve
-from kgs.datasets.scene import Scene, Views
+from kgs.datasets.scene import Scene
 from kgs.init_points import InitialPoints
 from kgs.losses import photometric_loss
 from kgs.model import GaussianModel
@@ -194,14 +194,6 @@ class Trainer:
         """The loss of a training step, 0-d: of an image `(1, 3, H, W)` beside its photo."""
         recipe = self.plan.config.recipe
         return photometric_loss(image, view.image, recipe.dssim_weight, moments=view.moments, backend=self.plan.backend)
-
-    def render(self, camera: PinholeCamera) -> Tensor:
-        """Render all Gaussians from one camera before the background of the scene, `(1, 3, H, W)`."""
-        return self.result().render(camera)
-
-    def psnr(self, views: Views) -> float | None:
-        """The mean PSNR over some views, see :meth:`Fit.psnr`."""
-        return self.result().psnr(views)
 
     def state_dict(self) -> dict[str, Any]:
         """The state, and what it belongs to: nested dicts of tensors and plain values, copied."""

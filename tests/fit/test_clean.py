@@ -59,7 +59,7 @@ def as_fit(model, photos_of=None):
 
 def artifacts_of(fit, strength=1.0):
     views = fit.scene.train
-    depths = [fit.median_depth(views.camera(i)) for i in range(len(views))]
+    depths = [fit.render_with_depth(views.camera(i))[1] for i in range(len(views))]
     return find_artifacts(fit.model, strength, views.cameras, depths)
 
 
