@@ -28,13 +28,13 @@ def field_size(scene: str | PathLike[str] | SceneSource) -> tuple[str, float | N
     source = SceneSource.of(scene)
     if (source.root / _FOLDER).is_dir() and source.has_sizes:
         return _FOLDER, None, f"photos of {_FOLDER}/, the size of published tables"
-    frame = source.frames().frames[0]
-    width, height = frame.image.size
+    width, height = source.photo_size()
     wanted = max(width, height)
     if source.layout == "Blender" and wanted == _BLENDER:
         wanted //= 2
     elif source.has_sizes:
-        full = max(frame.intrinsics.width, frame.intrinsics.height)
+        lens = source.frames().frames[0].intrinsics
+        full = max(lens.width, lens.height)
         wanted = round(full / _FACTOR) if full >= _LARGE else wanted
     factor = max(width, height) / wanted
     if factor <= 1.05:

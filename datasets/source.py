@@ -47,6 +47,13 @@ class SceneSource:
         """Whether the layout can have its photos in several sizes, a folder for each."""
         return self.layout in _WITH_SIZES
 
+    def photo_size(self, photo_folder: str = "") -> tuple[int, int]:
+        """Width and height of the first photo, which are those of all or turned; errors as of :meth:`frames`."""
+        frames = self.frames(photo_folder).frames
+        if not frames:
+            raise DataError(self.root, "", "expected posed images, got none")
+        return frames[0].image.size
+
     def frames(self, photo_folder: str = "") -> "FrameSet":
         """What the files say, with the photos of the folder of this name, else of the largest.
 

@@ -15,7 +15,7 @@ from torch.autograd.graph import increment_version
 
 from kgs._support.errors import ArgumentError
 
-from .backends import optimizer_stages
+from .backends import Backend, get_backend
 from .covariance import rotation_matrices
 from .model import GaussianModel
 from .types import ProjectedGaussians, check_kind
@@ -105,7 +105,7 @@ class Densifier:
         prune_opacity: float = 0.005,
         max_gaussians: int | None = None,
         generator: torch.Generator | None = None,
-        backend: str = "torch",
+        backend: str | Backend = "torch",
     ) -> None:
         check_kind("model", model, GaussianModel)
         maximum = 1 if max_gaussians is None else max_gaussians
@@ -131,7 +131,7 @@ class Densifier:
         self.prune_opacity = prune_opacity
         self.max_gaussians = max_gaussians
         self.generator = torch.Generator().manual_seed(0) if generator is None else generator
-        self._stages = optimizer_stages(backend, model.means)
+        self._backend = get_backend(backend, model.means.device).covering("optimizer", model.means)
         self._restart_statistics(torch.zeros_like(self.model.means[:, 0]))
         self._check()
 
@@ -178,8 +178,8 @@ class Densifier:
         ids = projected.gaussian_ids
         sums = self._statistics["gradient_sums"]
         counts = self._statistics["counts"]
-        if self._stages is not None and projected.num_cameras == 1:
-            self._stages.add_gradient_norms(sums, counts, ids, gradient, (width / 2, height / 2))
+        if self._backend.add_gradient_norms is not None and projected.num_cameras == 1:
+            self._backend.add_gradient_norms(sums, counts, ids, gradient, (width / 2, height / 2))
             return
         norms = torch.hypot(gradient[:, 0] * (width / 2), gradient[:, 1] * (height / 2)) * projected.num_cameras
         sums.index_add_(0, ids, norms)
@@ -241,8 +241,8 @@ class Densifier:
         if not 0.0 < factor < 1.0:
             raise ArgumentError("factor", "a number in (0, 1)", factor)
         logits = self.model.opacity_logits
-        if self._stages is not None and rows is None and logits.is_contiguous():
-            self._stages.decay_opacity(logits, factor)
+        if self._backend.decay_opacity is not None and rows is None and logits.is_contiguous():
+            self._backend.decay_opacity(logits, factor)
             increment_version(logits)
             return
         # of f s(x): log f - log(e^-x + 1 - f)

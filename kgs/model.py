@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from kgs._support.errors import ArgumentError, quoted
 
-from .backends import choose
+from .backends import Backend, get_backend
 from .geometry import log_spacing
 from .harmonics import SH_C0
 from .types import SH_SIZES, Gaussians, check_tensor
@@ -155,7 +155,7 @@ class GaussianModel(nn.Module):
     def sh_degree(self, value: int) -> None:
         self._sh_degree = _check_degree(value, self.max_sh_degree)
 
-    def forward(self, *, backend: str = "auto") -> Gaussians:
+    def forward(self, *, backend: str | Backend = "auto") -> Gaussians:
         """The Gaussians: activated scales and opacities, and harmonics up to the active degree.
 
         A Gaussian whose scale overflows has an infinite one, without gradient, and is not rendered.
@@ -164,10 +164,11 @@ class GaussianModel(nn.Module):
             backend: "auto", or the name of one, see `kgs.backends`. By "triton" differentiable once.
 
         Raises:
+            TypeError: the model is neither of float32 nor of float64.
             ValueError: the backend does not exist, or does not cover a model of this dtype or device.
             ModuleNotFoundError: the backend is numba or triton, and it is not installed.
         """
-        chosen = choose(backend, "activation", self.means.device, lambda candidate: candidate.covers(self.means))
+        chosen = get_backend(backend, self.means.device).covering("activation", self.means)
         # at degree 0 sh_rest gets no gradient, and an optimiser skips it
         parameters = (self.log_scales, self.opacity_logits, self.sh_dc, self.sh_rest)
         scales, opacities, colors = chosen.activate(*parameters, SH_SIZES[self.sh_degree])

@@ -10,10 +10,10 @@ from torch import Tensor, nn
 
 from kgs._support.errors import ArgumentError, quoted
 
-from .backends import check_backend, choose
+from .backends import Backend, check_backend, get_backend
 from .camera import Cameras
 from .projection import normals
-from .stages import composite, project
+from .stages import outside_graphs, project, rasterize
 from .types import Gaussians, RasterOptions, Rendering, check_kind, check_tensor, raster_options
 
 _OUTPUTS = ("image", "alpha", "depth", "median_depth", "normal")
@@ -72,7 +72,7 @@ class GaussianRenderer(nn.Module):
         opacity_layer: nn.Module | None = None,
         *,
         options: RasterOptions | None = None,
-        backend: str = "auto",
+        backend: str | Backend = "auto",
         **fields: Any,
     ) -> None:
         super().__init__()
@@ -83,6 +83,7 @@ class GaussianRenderer(nn.Module):
         self.options = raster_options(options, fields)
         self.backend = backend
 
+    @outside_graphs
     def forward(
         self,
         gaussians: Gaussians,
@@ -113,7 +114,8 @@ class GaussianRenderer(nn.Module):
         if opacities is not gaussians.opacities:
             gaussians = dataclasses.replace(gaussians, opacities=opacities)
         with_image = "image" in outputs
-        projected = project(gaussians, cameras, options=self.options, colors=with_image, backend=self.backend)
+        backend = get_backend(self.backend, opacities.device)
+        projected = project(gaussians, cameras, options=self.options, colors=with_image, backend=backend)
         features = {"image": projected.colors}
         if "depth" in outputs:
             features["depth"] = projected.depths[:, None]
@@ -121,7 +123,7 @@ class GaussianRenderer(nn.Module):
             features["normal"] = normals(gaussians, cameras, projected)
         values = torch.cat(list(features.values()), 1) if len(features) > 1 else projected.colors
         median = "median_depth" in outputs
-        result = composite(projected, values, options=self.options, median_depth=median, backend=self.backend)
+        result = rasterize(projected, values, self.options, backend, median_depth=median)
         images = {"image": result.features}
         if len(features) > 1:
             ends = accumulate((x.shape[1] for x in features.values()), initial=0)
@@ -132,7 +134,7 @@ class GaussianRenderer(nn.Module):
             images["depth"] = torch.where(covered, images["depth"] / torch.where(covered, alpha, 1.0), 0.0)
         image = None
         if with_image:
-            image = blend(images["image"], result.transmittance, background, self.backend)
+            image = blend(images["image"], result.transmittance, background, backend)
         return Rendering(
             image=image,
             alpha=1.0 - result.transmittance if "alpha" in outputs else None,
@@ -150,7 +152,7 @@ class GaussianRenderer(nn.Module):
 
 
 def blend(
-    image: Tensor, transmittance: Tensor, background: Tensor | None, backend: str, name: str = "background"
+    image: Tensor, transmittance: Tensor, background: Tensor | None, backend: Backend, name: str = "background"
 ) -> Tensor:
     """The image `(C, D, H, W)` over a background, seen through the transmittance `(C, 1, H, W)`."""
     if background is None:
@@ -162,5 +164,4 @@ def blend(
         background = background.reshape(*shape, 1, 1)
     elif shape not in (full[1:], full):
         raise ArgumentError(name, f"shape {full[1:2]}, {full[:2]}, {full[1:]} or {full}", shape)
-    chosen = choose(backend, "blending", image.device, lambda candidate: candidate.covers(image))
-    return chosen.blend(image, transmittance, background)
+    return backend.covering("blending", image).blend(image, transmittance, background)

@@ -11,10 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kgs._support.autograd import refuse_second_derivative
 from kgs._support.errors import ArgumentError
 
-from .backends import Backend, choose
-from .backends.base import CompositingCall, CompositingInputs, Compositor
+from .backends import Backend, get_backend
+from .backends.signatures import Compositor, Images
 from .camera import Cameras, image_size, intrinsics, with_constant_last_rows
 from .covariance import compensations, reach, variances
 from .types import (
@@ -49,7 +50,7 @@ def project(
     *,
     options: RasterOptions | None = None,
     colors: bool = True,
-    backend: str = "auto",
+    backend: str | Backend = "auto",
 ) -> ProjectedGaussians:
     """Project Gaussians into every camera of a batch.
 
@@ -87,8 +88,7 @@ def project(
     if shape[:-1] not in ((), (count,)):
         raise ArgumentError("opacities", f"shape ({n},) or ({count}, {n}) for {count} cameras", shape)
     cameras = with_constant_last_rows(cameras)
-    device = gaussians.means.device
-    chosen = choose(backend, "projection", device, lambda candidate: candidate.covers(gaussians.means))
+    chosen = get_backend(backend, gaussians.means.device).covering("projection", gaussians.means)
     return _with_options(chosen.project(gaussians, cameras, size, options, colors), options)
 
 
@@ -119,7 +119,7 @@ def composite(
     options: RasterOptions | None = None,
     median_depth: bool = False,
     chunk_size: int | None = None,
-    backend: str = "auto",
+    backend: str | Backend = "auto",
 ) -> Composited:
     """Composite features of projected Gaussians over all pixels of all cameras.
 
@@ -132,7 +132,7 @@ def composite(
         options: None for the defaults. Only tile_size, alpha_threshold, transmittance_stop, max_bytes and absgrad
             matter here.
         median_depth: also return the depth at which the transmittance falls below one half.
-        chunk_size: entries of a tile per step of the torch backend; None chooses by the length of the lists.
+        chunk_size: entries of a tile in a chunk of the torch backend; None chooses by the length of the lists.
         backend: "auto", or the name of one, see `kgs.backends`.
 
     Returns:
@@ -155,31 +155,32 @@ def composite(
     options = raster_options(options, {})
     if chunk_size is not None and (not isinstance(chunk_size, int | np.integer) or chunk_size < 1):
         raise ArgumentError("chunk_size", "an integer >= 1 or None", chunk_size)
-    if not isinstance(projected, ProjectedGaussians):
-        raise TypeError(f"projected: expected kgs.ProjectedGaussians, got {type(projected).__name__}")
-    call = CompositingCall(projected, features, options, median_depth, chunk_size)
-    return composite_call(call, backend)
+    check_kind("projected", projected, ProjectedGaussians)
+    _check_projected(projected, features)
+    chosen = get_backend(backend, features.device)
+    return rasterize(projected, features, options, chosen, median_depth=median_depth, chunk_size=chunk_size)
 
 
 @outside_graphs
-def composite_call(
-    call: CompositingCall, backend: str = "auto", absgrad_hook: Callable[[Tensor], None] | None = None
+def rasterize(
+    projected: ProjectedGaussians,
+    features: Tensor,
+    options: RasterOptions,
+    backend: Backend,
+    *,
+    median_depth: bool = False,
+    chunk_size: int | None = None,
+    absgrad_hook: Callable[[Tensor], None] | None = None,
 ) -> Composited:
-    """:func:`composite`; a hook takes the absolute gradients `(M, 2)` instead of `means2d.absgrad`."""
-    _check_projected(call.projected, call.features)
-
-    def covers(candidate: Backend) -> bool:
-        return candidate.covers(call.features) and candidate.covers_compositing(call)
-
-    chosen = choose(backend, "compositing", call.features.device, covers)
-    tile_size = call.options.tile_size or chosen.tile_size
-    call = replace(call, options=_with_tile_size(call.options, tile_size))
-    projected = call.projected
-    inputs = (projected.means2d, projected.factors, projected.opacities, call.features)
+    """:func:`composite` of arguments that fit; a hook takes the absolute gradients in place of `means2d.absgrad`."""
+    backend = backend.covering_compositing(projected, features, options, chunk_size)
+    tile_size = options.tile_size or backend.tile_size
+    compositor = backend.compositor(projected, features, _with_tile_size(options, tile_size), median_depth, chunk_size)
+    inputs = (projected.means2d, projected.factors, projected.opacities, features)
     keep = torch.is_grad_enabled() and any(x.requires_grad for x in inputs)
-    hook = _setter(projected.means2d) if absgrad_hook is None else absgrad_hook
-    sums, transmittance, median = _Composite.apply(*inputs, chosen.compositor(call), keep, hook)
-    return Composited(sums, transmittance, median if call.median_depth else None, tile_size)
+    hook = absgrad_hook or _setter(projected.means2d)
+    sums, transmittance, median = _Composite.apply(*inputs, compositor, keep, hook)
+    return Composited(sums, transmittance, median if median_depth else None, tile_size)
 
 
 @functools.lru_cache
@@ -188,8 +189,9 @@ def _with_tile_size(options: RasterOptions, tile_size: int) -> RasterOptions:
 
 
 def _setter(means2d: Tensor) -> Callable[[Tensor], None]:
-    """Sets `absgrad` of this very tensor, which graphs with hooks on saved tensors give back as another."""
-    given = weakref.ref(means2d)  # the tensor has a graph that has this function
+    """A function that sets `means2d.absgrad`."""
+    # of this very tensor: graphs with hooks on saved tensors give back another; it has a graph that has this function
+    given = weakref.ref(means2d)
 
     def set_absgrad(absgrad: Tensor) -> None:
         if (tensor := given()) is not None:
@@ -230,7 +232,6 @@ class _Composite(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any,
         means2d: Tensor,
         factors: Tensor,
         opacities: Tensor,
@@ -238,34 +239,23 @@ class _Composite(torch.autograd.Function):
         compositor: Compositor,
         keep: bool,
         absgrad_hook: Callable[[Tensor], None],
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        inputs = CompositingInputs(means2d, factors, opacities, features)
-        images, ctx.kept = compositor.forward(inputs, keep)
+    ) -> Images:
+        return compositor.forward((means2d, factors, opacities, features), keep)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Images) -> None:
+        *tensors, ctx.compositor, _, ctx.absgrad_hook = inputs
         ctx.set_materialize_grads(False)
-        ctx.shapes = [x.shape for x in images]
-        ctx.compositor = compositor
-        ctx.absgrad_hook = absgrad_hook
-        ctx.save_for_backward(*inputs)
-        ctx.mark_non_differentiable(images[2])
-        return images
+        ctx.shapes = [x.shape for x in output]
+        ctx.save_for_backward(*tensors)
+        ctx.mark_non_differentiable(output[2])
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        if torch.is_grad_enabled():
-            raise RuntimeError("composite: expected backward without create_graph, there is no second derivative")
-        needs = ctx.needs_input_grad[:4]
-        inputs = CompositingInputs(*ctx.saved_tensors)
-        like = inputs.features
-        sums, transmittance = (like.new_zeros(ctx.shapes[i]) if grads[i] is None else grads[i] for i in range(2))
-        # the state is freed after its first use; a second backward pass computes it again
-        gradients, absgrad = ctx.compositor.backward(inputs, _take(ctx), sums, transmittance, needs)
+        refuse_second_derivative("composite")
+        inputs = ctx.saved_tensors
+        sums, transmittance = (inputs[3].new_zeros(ctx.shapes[i]) if grads[i] is None else grads[i] for i in range(2))
+        gradients, absgrad = ctx.compositor.backward(inputs, sums, transmittance, ctx.needs_input_grad[:4])
         if absgrad is not None:
             ctx.absgrad_hook(absgrad)
         return *gradients, None, None, None
-
-
-def _take(ctx: Any) -> Any:
-    """Remove the state that `forward` kept from the context, and return it."""
-    kept = ctx.kept
-    ctx.kept = None
-    return kept

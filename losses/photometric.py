@@ -23,8 +23,9 @@ from kornia.filters import get_gaussian_kernel1d
 from kornia.losses import ssim_loss
 from torch import Tensor
 
+from kgs._support.autograd import refuse_second_derivative
 from kgs._support.errors import ArgumentError
-from kgs.backends import Backend, check_backend, choose
+from kgs.backends import Backend, get_backend
 
 WINDOW = 11  # pixels
 SIGMA = 1.5  # pixels, the standard deviation
@@ -58,7 +59,7 @@ def photometric_loss(
     mask: Tensor | None = None,
     fast: bool = True,
     moments: TargetMoments | None = None,
-    backend: str = "auto",
+    backend: str | Backend = "auto",
 ) -> Tensor:
     """Mean absolute difference plus `dssim_weight` times 1 - SSIM, as in the release of DropGaussian.
 
@@ -95,8 +96,8 @@ def photometric_loss(
         >>> float(photometric_loss(target, target)) < 1e-4
         True
     """
-    check_backend(backend)
     _check_images(image, image)
+    table = get_backend(backend, image.device).covering("loss", image)
     shape = (1, image.shape[0] * image.shape[1], *image.shape[-2:])
     moments = target if isinstance(target, TargetMoments) else moments
     if moments is not None and not isinstance(moments, TargetMoments):
@@ -113,17 +114,17 @@ def photometric_loss(
     if dssim_weight != 0.0 and min(shape[-2:]) <= RADIUS:
         raise ArgumentError("image", f"at least {RADIUS + 1} x {RADIUS + 1} pixels", f"{shape[-2]} x {shape[-1]}")
     fast = fast and not target.requires_grad
-    chosen = choose(backend, "loss", image.device, lambda candidate: candidate.covers(image))
-    if not chosen.has_loss or not fast or outside is not None or dssim_weight == 0.0 or min(shape[-2:]) < WINDOW:
+    if table.loss is None or not fast or outside is not None or dssim_weight == 0.0 or min(shape[-2:]) < WINDOW:
         return _torch_loss(image, target, moments, dssim_weight, outside, fast)
     moments = target_moments(target) if moments is None else moments
-    loss: Tensor = _PhotometricLoss.apply(image, target, moments.mean, moments.variance, dssim_weight, chosen)
+    keep = torch.is_grad_enabled() and image.requires_grad
+    loss: Tensor = _PhotometricLoss.apply(image, target, moments.mean, moments.variance, dssim_weight, table, keep)[0]
     return loss
 
 
 @torch.inference_mode(False)  # autograd could not save tensors made in inference mode
 @torch.no_grad()
-def target_moments(target: Tensor, *, backend: str = "torch") -> TargetMoments:
+def target_moments(target: Tensor, *, backend: str | Backend = "torch") -> TargetMoments:
     """The part of the SSIM that depends only on the target, for :func:`photometric_loss`; it carries no gradient.
 
     Args:
@@ -131,14 +132,13 @@ def target_moments(target: Tensor, *, backend: str = "torch") -> TargetMoments:
         backend: "torch", the bits of :func:`photometric_loss` without `moments`; "numba" or "auto" for targets that are
             used once: six times as fast where a kernel covers the call (float32 on a CPU, H, W >= 11).
     """
-    check_backend(backend)
     _check_images(target, target)
+    table = get_backend(backend, target.device).covering("loss", target)
     if min(target.shape[-2:]) <= RADIUS:
         raise ArgumentError("target", f"at least {RADIUS + 1} x {RADIUS + 1} pixels", tuple(target.shape))
     padded = F.pad(target.reshape(1, -1, *target.shape[-2:]), BORDER, mode="reflect")
-    chosen = choose(backend, "loss", target.device, lambda candidate: candidate.covers(target))
-    if chosen.has_moments and min(target.shape[-2:]) >= WINDOW:
-        return TargetMoments(padded, *chosen.local_moments(target, window_taps(target.dtype)))
+    if table.local_moments is not None and min(target.shape[-2:]) >= WINDOW:
+        return TargetMoments(padded, *table.local_moments(target, window_taps(target.dtype)))
     mean = _blur(padded)
     return TargetMoments(padded, mean, _blur(padded * padded).sub_(mean * mean))
 
@@ -178,33 +178,38 @@ def _torch_loss(
     moments = target_moments(target) if moments is None else moments
     outside = None if outside is None else outside.expand_as(image).reshape(moments.mean.shape)
     image = image.reshape(moments.mean.shape)
-    mean_ssim: Tensor = _MeanSsim.apply(image, moments.padded, moments.mean, moments.variance, outside)
+    keep = torch.is_grad_enabled() and image.requires_grad
+    mean_ssim: Tensor = _MeanSsim.apply(image, moments.padded, moments.mean, moments.variance, outside, keep)[0]
     return loss + dssim_weight * (1.0 - mean_ssim)
 
 
 class _PhotometricLoss(torch.autograd.Function):
-    """The loss of a backend."""
+    """The loss of a backend, followed by what it keeps for its gradient."""
 
     @staticmethod
     def forward(
-        ctx: Any, image: Tensor, target: Tensor, mean: Tensor, variance: Tensor, weight: float, backend: Backend
-    ) -> Tensor:
-        ctx.settings = (window_taps(image.dtype), weight)
-        ctx.stage = backend.loss
-        loss, kept = ctx.stage.forward(image, target, mean, variance, *ctx.settings, ctx.needs_input_grad[0])
-        ctx.save_for_backward(*kept)
-        return loss  # type: ignore[no-any-return]
+        image: Tensor, target: Tensor, mean: Tensor, variance: Tensor, weight: float, table: Backend, keep: bool
+    ) -> tuple[Tensor, ...]:
+        assert table.loss is not None
+        loss, kept = table.loss(image, target, mean, variance, window_taps(image.dtype), weight, keep)
+        return loss, *kept
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None, None, None]:
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        image, *_, ctx.weight, ctx.table, _ = inputs
+        ctx.taps = window_taps(image.dtype)
+        ctx.save_for_backward(*output[1:])
+        ctx.mark_non_differentiable(*output[1:])
+        ctx.set_materialize_grads(False)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor, *_: None) -> tuple[Tensor | None, ...]:
         _refuse_second_derivative()
-        return ctx.stage.backward(ctx.saved_tensors, *ctx.settings, grad), None, None, None, None, None
+        return ctx.table.loss_gradient(ctx.saved_tensors, ctx.taps, ctx.weight, grad), *[None] * 6
 
 
 def _refuse_second_derivative() -> None:
-    """Raise a RuntimeError in a backward pass with `create_graph`."""
-    if torch.is_grad_enabled():  # once_differentiable is silent where the incoming gradient is a constant
-        raise RuntimeError("photometric_loss: the fast path has no second derivative; pass fast=False")
+    refuse_second_derivative("photometric_loss", "; pass fast=False")
 
 
 class _MeanSsim(torch.autograd.Function):
@@ -215,8 +220,8 @@ class _MeanSsim(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, image: Tensor, target: Tensor, mean_y: Tensor, variance_y: Tensor, outside: Tensor | None
-    ) -> Tensor:
+        image: Tensor, target: Tensor, mean_y: Tensor, variance_y: Tensor, outside: Tensor | None, keep: bool
+    ) -> tuple[Tensor, ...]:
         padded = F.pad(image, BORDER, mode="reflect")
         mean = _blur(padded)
         mean_squared = mean * mean
@@ -227,7 +232,8 @@ class _MeanSsim(torch.autograd.Function):
         c = mean_squared.addcmul_(mean_y, mean_y).add_(C1)
         inverse = (c * d).add_(EPS).reciprocal_()
         ssim = (a * b).mul_(inverse)
-        if ctx.needs_input_grad[0]:
+        kept: tuple[Tensor, ...] = ()
+        if keep:
             # With r = 1 / (c d + eps): dS/da = b r, dS/db = a r, dS/dc = -S r d, dS/dd = -S r c. The local mean is in
             # all four (da = 2 m_y, db = -2 m_y, dc = 2 m_x, dd = -2 m_x), the product in b, the square in d.
             scaled = ssim * inverse
@@ -238,17 +244,24 @@ class _MeanSsim(torch.autograd.Function):
             if outside is not None:
                 for derivative in (by_mean, by_square, by_product):
                     derivative.masked_fill_(outside, 0.0)
-            ctx.save_for_backward(padded, target, by_mean, by_square, by_product)
-            ctx.count = ssim.numel() if outside is None else int((~outside).sum())
-        return _mean(ssim, outside).clamp_max(1.0)
+            kept = (padded, by_mean, by_square, by_product)
+        return _mean(ssim, outside).clamp_max(1.0), *kept
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None, None]:
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        _, target, mean_y, _, outside, _ = inputs
+        ctx.save_for_backward(target, *output[1:])
+        ctx.mark_non_differentiable(*output[1:])
+        ctx.set_materialize_grads(False)
+        ctx.count = mean_y.numel() if outside is None else int((~outside).sum())
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor, *_: None) -> tuple[Tensor | None, ...]:
         _refuse_second_derivative()
-        padded, target, by_mean, by_square, by_product = ctx.saved_tensors
+        target, padded, by_mean, by_square, by_product = ctx.saved_tensors
         pixels = _blur_adjoint(by_mean).addcmul_(padded, _blur_adjoint(by_square), value=2.0)
         pixels.addcmul_(target, _blur_adjoint(by_product))
-        return _fold(pixels).mul_(grad / ctx.count), None, None, None, None
+        return _fold(pixels).mul_(grad / ctx.count), *[None] * 5
 
 
 def _mean(values: Tensor, outside: Tensor | None) -> Tensor:

@@ -37,7 +37,7 @@ _FIRST = [
     "test_resume",
     *("test_kernels_projection", "test_synthetic", "test_house", "test_synthetic_room", "test_api", "test_wheel"),
     *("test_kernels_loss", "test_load", "test_transforms", "test_colmap", "test_page_browser", "test_trainer"),
-    *("test_cli", "test_results_folder", "test_init_points_dense", "test_kernels_compositing", "test_not_finite"),
+    *("test_cli", "test_fit_folder", "test_init_points_dense", "test_kernels_compositing", "test_not_finite"),
     *("test_gpu_fit", "test_bits", "test_extreme_cases", "test_cli_process", "test_run", "test_sfm_folders"),
 ]
 
@@ -66,10 +66,10 @@ def _runs_on_torch_again(item: pytest.Function) -> bool:
     return double or item.get_closest_marker("cuda") is not None or "torch_alone" in item.fixturenames
 
 
-@pytest.fixture(scope="module", params=sorted({"torch", backends.resolve("auto", torch.device("cpu"))}))
+@pytest.fixture(scope="module", params=sorted({"torch", backends.get_backend("auto", torch.device("cpu")).name}))
 def each_backend(request: pytest.FixtureRequest) -> Iterator[str]:
     """Run a test twice: "auto" means torch, then numba. Their bits differ."""
-    available = tuple(backend for backend in backends.BACKENDS if backend.name in ("torch", request.param))
+    available = {name: x for name, x in backends.BACKENDS.items() if name in ("torch", request.param)}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(backends, "BACKENDS", available)
         yield request.param
@@ -83,7 +83,8 @@ def each_device(request: pytest.FixtureRequest) -> Iterator[torch.device]:
         return
     skip_unless_there(Target(request.param))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(backends, "BACKENDS", tuple(b for b in backends.BACKENDS if b.name in ("torch", request.param)))
+        available = {name: x for name, x in backends.BACKENDS.items() if name in ("torch", request.param)}
+        patch.setattr(backends, "BACKENDS", available)
         yield CPU
 
 

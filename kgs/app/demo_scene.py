@@ -14,7 +14,6 @@ from kgs.datasets.folders import CAMERAS_REPORT, LAYOUT_FILES
 
 PHOTOS = Path(__file__).parent / "demo_photos"  # six training photos, two held out, and their cameras
 CREDIT = "Photos: Piero Toffanin, dataset_banana (MIT licence)."
-FILES = ("images", LAYOUT_FILES["nerfstudio"], CAMERAS_REPORT)  # that a scene has
 SIDE = 504  # pixels of the longer side, of the photos and by default of the room
 _SHAPE = 3 / 4  # height of the room's pictures, relative to their width
 
@@ -23,7 +22,7 @@ def write_bananas(folder: Path) -> None:
     """Write the photos of the package and their cameras to a folder."""
     content = read_json(PHOTOS / LAYOUT_FILES["nerfstudio"])
     images = folder / "images"
-    images.mkdir()
+    images.mkdir(exist_ok=True)
     for path in (*PHOTOS.glob("*.jpg"), PHOTOS / "LICENSE"):
         shutil.copyfile(path, images / path.name)
     for key in ("train_filenames", "test_filenames"):
@@ -38,7 +37,7 @@ def write_room(folder: Path, side: int, seed: int) -> None:
     """Draw the synthetic room, `side` pixels wide, from three training and three held-out cameras."""
     height = round(_SHAPE * side)
     scene = synthetic_scene(train_views=3, test_views=3, size=(height, side), seed=seed)
-    (folder / "images").mkdir()
+    (folder / "images").mkdir(exist_ok=True)
     frames = list[dict[str, Any]]()
     for views in (scene.train, scene.test):
         poses = camtoworld_vision_to_graphics_4x4(torch.linalg.inv(views.cameras.extrinsics.double()))

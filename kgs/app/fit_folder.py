@@ -1,27 +1,17 @@
 """What `kgs fit` does, in its order: scene, initial points, training, files, page; then all is published."""
 
 from collections.abc import Callable
-from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from kgs._support.errors import DataError, printable
+from kgs._support.errors import printable
 from kgs._support.json_files import write_json
 from kgs._support.machine import check_packages
 from kgs.app.files.cameras import as_taken
 from kgs.app.files.figures import write_curve
-from kgs.app.files.locks import locked
-from kgs.app.files.outputs import check_folder, png_names, write_png
-from kgs.app.files.publishing import UNFINISHED, discard, enter, publish, replacing
-from kgs.app.files.results_folder import (
-    CHECKPOINT,
-    PREVIOUS,
-    check_fit_files,
-    discard_fit,
-    has_fit,
-    is_finished,
-    step_of,
-)
+from kgs.app.files.fit_files import CHECKPOINT, former_fit, is_finished, step_of
+from kgs.app.files.outputs import png_names, write_png
+from kgs.app.files.results import Results
 from kgs.app.page.fit_page import write_own_page
 from kgs.datasets.scene import Scene
 from kgs.fit.checkpoint import save_checkpoint
@@ -54,7 +44,7 @@ class Published(NamedTuple):
 def fit_folder(
     scene: Scene,
     config: FitConfig,
-    out: str | PathLike[str],
+    results: Results,
     request: SceneRequest,
     *,
     resume: bool = False,
@@ -65,88 +55,78 @@ def fit_folder(
 ) -> Published:
     """Fit a scene and write all results of `kgs fit`: splat, film, page, metrics, test images and checkpoints.
 
-    New results are collected in the folder `unfinished` in `out`, and replace those of a former fit only when all are
-    there. A fit that a signal stopped writes its results too, but replaces neither a finished fit nor one that got
-    further.
+    New results are collected in `results.work`, and replace those of a former fit only when all are there. A fit that a
+    signal stopped writes its results too, but replaces neither a finished fit nor one that got further.
 
     Args:
         scene: posed training and test views.
         config: the settings of the fit.
-        out: the folder for the results, created if it does not exist.
+        results: the folder for the results.
         request: how the scene was loaded, for config.json, and how the page shows it.
-        resume: continue the fit in `out/unfinished`, or if there is none that in `out`.
+        resume: continue the fit in `results.work`, or if there is none that in `results.out`.
         lpips: the perceptual metric, or None to leave it out.
         held_out: the measures of :func:`kgs.app.held_out.measure_held_out`, for metrics.json and the page.
         say: called with each line for the user.
         stages: names the stages as they begin.
 
     Raises:
-        DataError: the checkpoint is damaged or belongs to another fit, images are too small, kgs is at work on a fit in
-            `out`, `out` cannot be written to or holds the files of a scene, what no fit wrote has the name of a result,
-            or there is an unfinished fit and `resume` is False.
+        DataError: the checkpoint is damaged or belongs to another fit, or images are too small.
         TrainingDiverged: a number is not finite, or a scale explodes; the last checkpoint is kept.
         OSError: a result cannot be written.
         ValueError: the device cannot be used, or the backend does not run on it.
         ModuleNotFoundError: the backend is numba or triton, which is not installed; or a package of the extra `app` is
             missing.
     """
-    out = Path(out)
+    out = results.out
+    work = results.work
     stages = Stages(say) if stages is None else stages
     check_packages("jinja2")  # even what is used only after training
     check_before_points(scene, config, lpips is not None)
-    names = png_names([*scene.train.names, *scene.test.names])
-    _check_out(out, scene)
-    with locked(out):
-        check_fit_files(out, resume, [f"{_TEST}/{names[view]}" for view in scene.test.names])
-        work = out / UNFINISHED
-        former = _former(out, resume, say)
-        notes = _Notes(say)
+    former = _former(out, resume, say)
+    notes = _Notes(say)
 
-        def begin(trainer: Trainer) -> None:
-            say(f"resumed at step {trainer.step}" if former else _expectation(trainer))
-            work.mkdir(exist_ok=True)
-            notes.say_new(trainer)
-            if not (work / CHECKPOINT).exists():
-                save_checkpoint(work / CHECKPOINT, trainer.state_dict())  # initial points can take a minute
-            with replacing(work, "fit") as new:
-                write_json(new / "config.json", _settings(trainer, request))
-            stages.begin("fit")
-
-        if former is None:
-            stages.begin("initial points")
-        training = Training(work / CHECKPOINT, begun=begin)
-        try:
-            trainer, fit = training.fit(scene, config, former)
-        except BaseException:
-            if training.trainer is not None and not training.trainer.saved:
-                discard_fit(work)
-            raise
-        try:
-            with replacing(work, "fit", keep_on_error=True) as new:
-                stages.begin("film")
-                fit = _write_results(fit, new, names, request, lpips, held_out)
-                for note in fit.notes:
-                    trainer.state.note(note)
-                stages.begin("page")
-                write_own_page(new, out, fit, request, _settings(trainer, request))
-                if not trainer.is_saved:  # results and checkpoint belong together
-                    trainer.save(work / CHECKPOINT, fit.part)
-            enter(work, "fit", (CHECKPOINT, PREVIOUS))
-        except BaseException:
-            notes.say_new(trainer)
-            say(f"{printable(new)}: holds the results that could be written")
-            raise
-        folder = out
-        is_done = trainer.step >= trainer.plan.schedule.steps
-        if not is_done and (is_finished(out) or step_of(out) > trainer.step):
-            folder = work
-            kept = f"{printable(out)} keeps its {_state(out)}; this one is in {printable(work)}"
-            trainer.state.note(f"{kept}, where a resumed fit goes on")
-        else:
-            if Path(scene.root).resolve() != work.resolve():
-                discard(work, "photos")  # of another fit: those of this one are published with it
-            publish(work, out)
+    def begin(trainer: Trainer) -> None:
+        say(f"resumed at step {trainer.step}" if former else _expectation(trainer))
+        results.begin()
+        work.mkdir(exist_ok=True)
         notes.say_new(trainer)
+        if not (work / CHECKPOINT).exists():
+            save_checkpoint(work / CHECKPOINT, trainer.state_dict())  # initial points can take a minute
+        write_json(work / "config.json", _settings(trainer, request))
+        stages.begin("fit")
+
+    if former is None:
+        stages.begin("initial points")
+    training = Training(work / CHECKPOINT, begun=begin)
+    try:
+        trainer, fit = training.fit(scene, config, former)
+    except BaseException:
+        if training.trainer is not None and not training.trainer.saved:
+            results.discard("fit")
+        raise
+    try:
+        stages.begin("film")
+        fit = _write_results(fit, work, request, lpips, held_out)
+        for note in fit.notes:
+            trainer.state.note(note)
+        stages.begin("page")
+        write_own_page(work, out, fit, request, _settings(trainer, request))
+        if not trainer.is_saved:  # results and checkpoint belong together
+            trainer.save(work / CHECKPOINT, fit.part)
+    except BaseException:
+        notes.say_new(trainer)
+        say(f"{printable(work)}: holds the results that could be written")
+        raise
+    folder = out
+    is_done = trainer.step >= trainer.plan.schedule.steps
+    if not is_done and (is_finished(out) or step_of(out) > trainer.step):
+        folder = work
+        kept = f"{printable(out)} keeps its {_state(out)}; this one is in {printable(work)}"
+        trainer.state.note(f"{kept}, where a resumed fit goes on")
+    else:
+        has_own_photos = Path(scene.root).resolve() == work.resolve()
+        results.publish("fit", *(["photos"] if has_own_photos else []))
+    notes.say_new(trainer)
     return Published(fit, training.signal, folder)
 
 
@@ -155,17 +135,9 @@ def _state(folder: Path) -> str:
     return "finished fit" if is_finished(folder) else f"fit, which got to step {step_of(folder)}"
 
 
-def _check_out(out: Path, scene: Scene) -> None:
-    """Make the folder; a DataError where it cannot be written to, or holds the files of a scene."""
-    try:
-        check_folder(out, scene.root)
-    except OSError as error:
-        raise DataError(out, "", "a folder that results can be written to", advice=f"{error.strerror}") from error
-
-
 def _former(out: Path, resume: bool, say: Callable[[str], None]) -> Path | None:
     """The checkpoint that the fit goes on from; None for one that begins, and says so where there is another."""
-    folder = next((folder for folder in (out / UNFINISHED, out) if has_fit(folder)), None)
+    folder = former_fit(out)
     if resume and folder is not None:
         return folder / CHECKPOINT
     if resume:
@@ -210,19 +182,15 @@ def _settings(trainer: Trainer, request: SceneRequest) -> dict[str, Any]:
 
 
 def _write_results(
-    fit: Fit,
-    folder: Path,
-    names: dict[str, str],
-    request: SceneRequest,
-    lpips: Lpips | None,
-    held_out: dict[str, Any] | None,
+    fit: Fit, folder: Path, request: SceneRequest, lpips: Lpips | None, held_out: dict[str, Any] | None
 ) -> Fit:
     """Write all files but the page; returns the fit with its metrics."""
     scene = fit.scene
+    names = png_names([*scene.train.names, *scene.test.names])
     save_ply(folder / "splat.ply", fit.model, offset=scene.offset)
     write_curve(folder / "curve.png", {"": fit.history["curve"]})
     notes = write_exports(fit, folder, request.roll)
-    (folder / _TEST).mkdir()
+    (folder / _TEST).mkdir(exist_ok=True)
     for i, name in each(list(enumerate(scene.test.names)), "test pictures", "view"):
         picture = scene.test.as_photo(i, fit.test_renders[i].image[0])
         write_png(folder / _TEST / names[name], as_taken(picture, scene.test, i))

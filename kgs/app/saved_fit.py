@@ -9,9 +9,9 @@ from torch import Tensor
 
 from kgs._support.errors import DataError, quoted
 from kgs._support.json_files import read_json
-from kgs.app.files.publishing import complete
-from kgs.app.files.results_folder import CHECKPOINT
-from kgs.backends import former_or_auto
+from kgs.app.files.fit_files import CHECKPOINT
+from kgs.app.files.results import complete
+from kgs.backends import get_backend
 from kgs.datasets.scene import Scene
 from kgs.fit.checkpoint import errors_of, newest_checkpoint
 from kgs.fit.config import Settings
@@ -66,7 +66,7 @@ def load_fit(
         part = values.get("shown", {})
         model = (model.select(**part) if part else model).to(device)
     if backend == "auto":
-        backend = former_or_auto(values["backend"], model.means.device)
+        backend = get_backend(values["backend"], model.means.device, required=False).name
     if values["step"] != metrics.get("steps"):
         whose = "that of the previous checkpoint, " if damage else ""
         expected = f"that of metrics.json, {metrics.get('steps')}"

@@ -4,15 +4,16 @@ import re
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from kgs._support.errors import DataError, quoted
 from kgs._support.json_files import is_number
-from kgs.datasets.load import load_scene
 from kgs.datasets.options import MASK_MODES
-from kgs.datasets.scene import Scene
 from kgs.datasets.source import SceneSource
 from kgs.fit.config import DETAILS
+
+if TYPE_CHECKING:
+    from kgs.datasets.scene import Scene
 
 _LARGER = 1.1  # how many times as large photos must be to be worth a line
 
@@ -49,7 +50,7 @@ class SceneRequest:
     masks: str = ""
     mask_mode: str = "ignore"
 
-    def load(self, base: Path, say: Callable[[str], None] | None = None, source: SceneSource | None = None) -> Scene:
+    def load(self, base: Path, say: Callable[[str], None] | None = None, source: SceneSource | None = None) -> "Scene":
         """Load the scene.
 
         Args:
@@ -57,6 +58,8 @@ class SceneRequest:
             say: gets the loader's notes.
             source: the folder of the scene where it is open already.
         """
+        from kgs.datasets.load import load_scene
+
         scene = load_scene(
             source or base / self.scene,
             self.train_views,
@@ -77,18 +80,17 @@ class SceneRequest:
         """The title of the page: as asked for, else the name of the folder in plain words."""
         return self.title or in_plain_words((base / self.scene).resolve().name)
 
-    def full_side(self, scene: Scene) -> int | None:
+    def full_side(self, scene: "Scene") -> int | None:
         """The longer side in pixels with `--detail high`; None where the photos of the fit are about as large."""
         side = max(scene.train.images.shape[-2:])
         largest = min(DETAILS["high"].size, round(side * (self.downscale or 1.0)))
         return largest if largest > _LARGER * side else None
 
-    def shrink(self, scene: Scene) -> float:
+    def shrink(self, scene: "Scene") -> float:
         """By what factor the photos of `scene` are smaller than the largest that its folder has."""
         factor = self.downscale or 1.0
         if self.photo_folder:
-            largest = load_scene(scene.root, photos=False, hold_out=0).train.images.shape[-1]
-            factor *= largest / scene.train.images.shape[-1]
+            factor *= max(SceneSource(scene.root).photo_size()) / max(scene.train.images.shape[-2:])
         return factor
 
     def to_dict(self) -> dict[str, Any]:

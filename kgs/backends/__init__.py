@@ -5,124 +5,72 @@
     "triton"  float32 on GPUs that torch calls "cuda" (NVIDIA, AMD) or "xpu" (`kgs.backends.gpu`; torch brings Triton on
               Linux); on others, as "mps", torch is the only one
 
-A backend is a class that names its stages, see :class:`Backend`; a new one is a folder, and a line in `BACKENDS`.
+A backend is a table of stages, see :class:`Backend`; a new one is a folder, and a line in `BACKENDS`. A renderer, a
+model or a fit chooses once, by :func:`get_backend`, and hands the table down.
 """
 
-from collections.abc import Callable
+from dataclasses import replace
 
-from torch import Tensor
 from torch import device as Device  # `import torch` would be taken for the folder of that name here
+from torch.compiler import is_compiling
 
 from kgs._support.errors import ArgumentError, quoted
 
-from .base import Backend, OptimizerStages
-from .cpu import CpuBackend
-from .gpu import GpuBackend
-from .torch import TorchBackend
+from .cpu import NUMBA
+from .gpu import TRITON
+from .table import TORCH, Backend
 
-__all__ = [
-    "BACKENDS",
-    "Backend",
-    "available",
-    "check_backend",
-    "choose",
-    "former_or_auto",
-    "optimizer_stages",
-    "resolve",
-    "takes_kernels",
-]
+__all__ = ["BACKENDS", "Backend", "available", "check_backend", "get_backend"]
 
-# "auto" takes the first that covers a call and is trusted
-BACKENDS: tuple[Backend, ...] = (CpuBackend(), GpuBackend(), TorchBackend())
+# "auto" takes the first that is installed, runs on the device and is trusted there
+BACKENDS: dict[str, Backend] = {backend.name: backend for backend in (NUMBA, TRITON, TORCH)}
 
 
 def available() -> tuple[str, ...]:
     """The names that a `backend` argument may have."""
-    return ("auto", *sorted(backend.name for backend in BACKENDS))
+    return ("auto", *sorted(BACKENDS))
 
 
-def check_backend(name: str) -> None:
+def check_backend(name: str | Backend) -> None:
     """Raise a ValueError for a backend that does not exist, a ModuleNotFoundError for one that is not installed."""
-    if name not in available():
+    if isinstance(name, Backend) or name == "auto":
+        return
+    if name not in BACKENDS:
         raise ArgumentError("backend", f"one of {available()}", quoted(name))
-    for backend in BACKENDS:
-        if backend.name == name and backend.package and not backend.is_installed():
-            package, how = backend.package
-            raise ModuleNotFoundError(f'backend: "{name}" needs {package}, {how}', name=package)
+    backend = BACKENDS[name]
+    if backend.package and not backend.is_installed():
+        package, how = backend.package
+        raise ModuleNotFoundError(f'backend: "{name}" needs {package}, {how}', name=package)
 
 
-def resolve(name: str, device: Device) -> str:
-    """The name of the backend that "auto" takes for float32 on a device; other names are returned unchanged.
-
-    Raises:
-        ValueError: the backend does not exist, or it does not run on the device.
-        ModuleNotFoundError: it is named and not installed.
-    """
-    check_backend(name)
-    for backend in BACKENDS:
-        if backend.runs_on(device) and backend.is_installed() and _may_take(backend, name, device):
-            return backend.name
-    devices = next(" and ".join(backend.devices or ()) for backend in BACKENDS if backend.name == name)
-    others = "".join(f'; "{x.name}" runs on {device}, too' for x in BACKENDS if x.devices and x.runs_on(device))
-    reason = f"which runs on {devices} alone{others}"
-    raise ArgumentError("backend", f'"auto" or "torch" on {device}', f'"{name}", {reason}')
-
-
-def former_or_auto(name: str, device: Device) -> str:
-    """The name of the backend of an earlier fit where that is installed and runs on the device, else "auto"."""
-    former = [backend for backend in BACKENDS if backend.name == name]
-    return name if any(backend.runs_on(device) and backend.is_installed() for backend in former) else "auto"
-
-
-def choose(name: str, stage: str, device: Device, covers: Callable[[Backend], bool]) -> Backend:
-    """The backend for a call: for "auto" the first that covers it and is trusted, else the one that is named.
+def get_backend(name: str | Backend, device: Device, *, required: bool = True) -> Backend:
+    """The backend of a name on a device; for "auto" the first that is installed, runs there and is trusted.
 
     Args:
-        name: what the user asked for.
-        stage: what is to be done, for the error.
-        device: where.
-        covers: whether a backend can do the call.
+        name: one of :func:`available`; a `Backend` is returned as it is.
+        device: where it will run.
+        required: whether a backend that is named must be there; if not, "auto" takes its place.
 
     Raises:
-        ValueError: the backend does not exist, or it is named and does not cover the call.
+        ValueError: the backend does not exist, or does not run on the device.
         ModuleNotFoundError: it is named and not installed.
     """
-    for backend in BACKENDS:
-        if name in ("auto", backend.name) and covers(backend) and _may_take(backend, name, device):
-            return backend
-    check_backend(name)
-    raise ArgumentError("backend", f'"auto" or "torch" for this call of {stage}', f"{name!r}, which does not cover it")
+    if isinstance(name, Backend):
+        return name
+    if name == "auto" and is_compiling():  # a graph that is traced has no kernels
+        return TORCH
+    if required:
+        check_backend(name)
+    named = BACKENDS.get(name)
+    if named is not None and named.is_installed() and named.runs_on(device):
+        return replace(named, is_named=True)
+    if named is not None and required:
+        raise _not_on(device, named)
+    return next(x for x in BACKENDS.values() if x.is_installed() and x.runs_on(device) and x.is_trusted(device))
 
 
-def optimizer_stages(name: str, like: Tensor) -> OptimizerStages | None:
-    """What a backend has for an optimizer of parameters like this one; None where torch does it.
-
-    Raises:
-        ValueError: the backend does not exist, or it is named and does not cover such a tensor.
-        ModuleNotFoundError: it is named and not installed.
-    """
-    chosen = choose(name, "optimizer", like.device, lambda backend: backend.covers(like))
-    return chosen.optimizer if chosen.has_optimizer else None
-
-
-def takes_kernels(name: str, stage: str, like: Tensor) -> bool:
-    """Whether a stage outside the renderer runs on numba kernels; for stages that exist in numba and torch only.
-
-    These work on a CPU, also where the name is that of a backend of GPUs.
-
-    Raises:
-        ValueError: the backend does not exist, or numba is named and does not cover such a tensor.
-        ModuleNotFoundError: numba is named and not installed.
-    """
-    check_backend(name)
-    if name == TorchBackend.name:
-        return False
-    name = name if name == CpuBackend.name else "auto"
-    known = (CpuBackend.name, TorchBackend.name)
-    chosen = choose(name, stage, like.device, lambda backend: backend.name in known and backend.covers(like))
-    return chosen.name == CpuBackend.name
-
-
-def _may_take(backend: Backend, name: str, device: Device) -> bool:
-    """Whether this is the backend that is named, or one that "auto" may take on a device."""
-    return name == backend.name or (name == "auto" and backend.is_trusted(device))
+def _not_on(device: Device, named: Backend) -> ArgumentError:
+    kernels = [backend.name for backend in BACKENDS.values() if backend.devices and backend.runs_on(device)]
+    others = "".join(f'; "{name}" runs on {device}, too' for name in kernels)
+    reason = f"which runs on {' and '.join(named.devices or ())} alone{others}"
+    return ArgumentError("backend", f'"auto" or "torch" on {device}', f'"{named.name}", {reason}')

@@ -6,12 +6,11 @@ from typing import NamedTuple
 
 import torch
 
-from kgs import backends
 from kgs._support.errors import cause_of
 from kgs._support.extras import installing
 from kgs._support.machine import check_device, versions
-from kgs.backends import Backend
-from kgs.backends.agreement import BOUND, disagreement
+from kgs.backends import BACKENDS, Backend, get_backend
+from kgs.backends.self_check import BOUND, largest_error
 from kgs.camera import move_camera
 from kgs.renderer import GaussianRenderer
 from kgs.types import RasterOptions
@@ -36,7 +35,7 @@ _NO_TRITON = {"mps": "Apple's GPUs have no Triton, and kgs has not been tried on
 class _Result(NamedTuple):
     """How a backend does on a device: error, milliseconds by count, and what is wrong, "" if nothing is."""
 
-    agreement: float
+    error: float
     milliseconds: list[float]
     wrong: str
 
@@ -61,8 +60,8 @@ def check(*, device: str | None = None) -> int:
     faults = 0
     for each in devices:
         print(f"{each}: {_describe(each)}")
-        taken = backends.resolve("auto", each)
-        for backend in backends.BACKENDS:
+        taken = get_backend("auto", each).name
+        for backend in BACKENDS.values():
             result = _examine(backend, each) if _is_there(backend, each) else _Result(0.0, [], "")
             faults += bool(result.wrong)
             print(f"  {backend.name:<22}{_row(backend, each, result, backend.name == taken)}")
@@ -103,8 +102,8 @@ def _examine(backend: Backend, device: torch.device) -> _Result:
     """Agreement and times; what is wrong in one line."""
     try:
         off = _off_by(backend.name, device)
-        if backend.has_loss:  # kernels
-            off = max(off, disagreement(backend, device))
+        if backend.name != "torch":
+            off = max(off, largest_error(backend, device))
         milliseconds = [1e3 * _seconds(count, backend.name, device) for count in COUNTS]
     except Exception as error:  # whatever a compiler, a driver or a broken package does
         return _Result(float("nan"), [], cause_of(error))
@@ -133,11 +132,11 @@ def _seconds(count: int, backend: str, device: torch.device) -> float:
 def _row(backend: Backend, device: torch.device, result: _Result, taken: bool) -> str:
     """The line of a backend, without its name."""
     if result.wrong:
-        return f"WRONG: {result.wrong}" + (f" (off by {result.agreement:.1e})" if result.milliseconds else "")
+        return f"WRONG: {result.wrong}" + (f" (off by {result.error:.1e})" if result.milliseconds else "")
     if not result.milliseconds:
         package, how = backend.package or ("", "")
         if backend.runs_on(device) and not backend.is_installed():
             return f"not installed: {package}; {how}"
         return f"not for {device.type}"
     times = "".join(f"{value:>8.1f} ms" for value in result.milliseconds)
-    return f"{result.agreement:>9.1e}{times}{'   auto takes it' if taken else ''}"
+    return f"{result.error:>9.1e}{times}{'   auto takes it' if taken else ''}"

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from kgs._support.machine import check_device, peak_rss_mb
-from kgs.backends import resolve
+from kgs.backends import Backend, get_backend
 from kgs.backends.torch.binning import bin_to_tiles
 from kgs.camera import move_camera
 from kgs.fit.adam import Adam
@@ -97,7 +97,7 @@ def speed(*, out: Path, quick: bool = False, device: str = "cpu") -> None:
 
 def backends(device: torch.device) -> list[str]:
     """Those that can be compared."""
-    return list(dict.fromkeys(["torch", resolve("auto", device)]))
+    return list(dict.fromkeys(["torch", get_backend("auto", device).name]))
 
 
 class Cases:
@@ -114,7 +114,7 @@ class Cases:
         self.weights = torch.rand(1, 3, *size, generator=generator).to(device) / math.prod(size)
         self.photo = torch.rand(1, 3, *size, generator=generator).to(device)
         self.moments = target_moments(self.photo)
-        self._optimizers: dict[str, Adam] = {}
+        self._optimizers: dict[str | Backend, Adam] = {}
         with torch.no_grad():
             bins = bin_to_tiles(project(self.model(), self.camera))
         self.pairs = bins.entries.shape[0] * bins.tile_size**2 / 1e6

@@ -12,8 +12,8 @@ from torch.autograd.graph import increment_version
 
 from kgs._support.errors import ArgumentError
 from kgs._support.torch_threads import torch_on_all_threads
-from kgs.backends import optimizer_stages
-from kgs.backends.base import AdamUpdate
+from kgs.backends import Backend, get_backend
+from kgs.backends.signatures import AdamUpdate
 
 _BETAS = (0.9, 0.999)
 
@@ -33,11 +33,12 @@ class Adam:
         state: for each parameter its `step`, a number, `exp_avg` and `exp_avg_sq`; empty before its first gradient.
     """
 
-    def __init__(self, groups: list[dict[str, Any]], eps: float = 1e-8, backend: str = "torch") -> None:
+    def __init__(self, groups: list[dict[str, Any]], eps: float = 1e-8, backend: str | Backend = "torch") -> None:
         self.param_groups = groups
         self.state: defaultdict[Tensor, Any] = defaultdict(dict)
         self.eps = eps
-        self._stages = optimizer_stages(backend, groups[0]["params"][0])
+        parameter = groups[0]["params"][0]
+        self._adam_step = get_backend(backend, parameter.device).covering("optimizer", parameter).adam_step
 
     def step(self) -> None:
         """Change each parameter that has a gradient."""
@@ -55,12 +56,12 @@ class Adam:
                 state["exp_avg_sq"] = torch.zeros_like(parameter)
             state["step"] += 1.0
             update = AdamUpdate(parameter, gradient, state["exp_avg"], state["exp_avg_sq"], group["lr"], state["step"])
-            covered = self._stages is not None and parameter.is_contiguous()
+            covered = self._adam_step is not None and parameter.is_contiguous()
             (by_kernel if covered else by_torch).append(update)
         if by_torch:
             self._step_by_torch(by_torch)
-        if self._stages is not None and by_kernel:
-            self._stages.adam(by_kernel, _BETAS, self.eps)
+        if self._adam_step is not None and by_kernel:
+            self._adam_step(by_kernel, _BETAS, self.eps)
             for update in by_kernel:
                 increment_version(update.parameter)
 

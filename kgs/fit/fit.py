@@ -9,6 +9,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs._support.torch_threads import threads_beside
+from kgs.backends import Backend, get_backend
 from kgs.camera import move_camera
 from kgs.datasets.scene import Scene, Views
 from kgs.metrics.evaluate import mean_psnr
@@ -56,8 +57,12 @@ class Fit:
         return self.model.means.device
 
     @cached_property
+    def _table(self) -> Backend:
+        return get_backend(self.backend, self.device)
+
+    @cached_property
     def _renderer(self) -> GaussianRenderer:
-        return GaussianRenderer(options=self.options, backend=self.backend).eval()
+        return GaussianRenderer(options=self.options, backend=self._table).eval()
 
     @cached_property
     def _background(self) -> Tensor | None:
@@ -101,11 +106,11 @@ class Fit:
         background = self._background if gains is None else None
         outputs = ("image", *outputs) if gains is None else ("image", "alpha", *outputs)
         with threads_beside(self.backend):
-            rendering: Any = self._renderer(self.model(backend=self.backend), camera, background, outputs=outputs)
+            rendering: Any = self._renderer(self.model(backend=self._table), camera, background, outputs=outputs)
         if gains is None:
             return rendering.image, rendering
         exposed = rendering.image * gains.to(rendering.image)[:, None, None]
-        return blend(exposed, 1.0 - rendering.alpha, self._background, self.backend), rendering
+        return blend(exposed, 1.0 - rendering.alpha, self._background, self._table), rendering
 
     def psnr(self, views: Views) -> float | None:
         """The mean PSNR of clamped renders over some views, in dB. Without views, or if one is infinite: None."""

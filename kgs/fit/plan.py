@@ -7,7 +7,7 @@ from typing import NamedTuple, Self
 import torch
 
 from kgs._support.machine import check_device
-from kgs.backends import resolve
+from kgs.backends import get_backend
 from kgs.datasets.scene import Scene
 from kgs.init_points import InitialPoints
 from kgs.init_points.dense import FEW_VIEWS
@@ -106,7 +106,7 @@ def check_machine(config: FitConfig) -> tuple[torch.device, str]:
         ModuleNotFoundError: the backend is numba or triton, and it is not installed.
     """
     device = check_device(config.device)
-    return device, resolve(config.backend, device)
+    return device, get_backend(config.backend, device).name
 
 
 def make_schedule(config: Settings) -> Schedule:

@@ -8,6 +8,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs._support.memory import empty
+from kgs.backends import Backend
 from kgs.camera import move_camera
 from kgs.datasets.scene import Scene, Views
 from kgs.losses import TargetMoments, target_moments
@@ -36,7 +37,7 @@ class Target(NamedTuple):
         """The background to render with, so that :meth:`as_photographed` shows this one, `(3,)`."""
         return background if self.gains is None or background is None else background / self.gains[:, 0, 0]
 
-    def over_background(self, background: Tensor, backend: str) -> Self:
+    def over_background(self, background: Tensor, backend: Backend) -> Self:
         """The view over another background, `(3,)`, with moments by the backend of the loss."""
         if self.background_weight is None:
             return self

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from kgs._support.errors import ArgumentError, TrainingDiverged
 from kgs._support.torch_threads import threads_beside
-from kgs.backends import BACKENDS, resolve
+from kgs.backends import BACKENDS, get_backend
 from kgs.datasets.scene import Scene
 from kgs.init_points import InitialPoints
 from kgs.losses import photometric_loss
@@ -87,12 +87,13 @@ class Trainer:
         """Train on from a state, on a scene with the gains that were decided."""
         config = self.plan.config
         self.state = state
+        self._backend = get_backend(self.plan.backend, self.plan.device)
         self.renderer = GaussianRenderer(
             state.drop,
             near_plane=state.start.near_plane,
             max_bytes=config.max_bytes,
             absgrad=config.recipe.absgrad,
-            backend=self.plan.backend,
+            backend=self._backend,
         ).train()
         self._exposed_scene = scene
         self._views = targets(scene.train, scene.background, self.plan.device)
@@ -193,7 +194,7 @@ class Trainer:
     def loss_of(self, image: Tensor, view: Target) -> Tensor:
         """The loss of a training step, 0-d: of an image `(1, 3, H, W)` beside its photo."""
         recipe = self.plan.config.recipe
-        return photometric_loss(image, view.image, recipe.dssim_weight, moments=view.moments, backend=self.plan.backend)
+        return photometric_loss(image, view.image, recipe.dssim_weight, moments=view.moments, backend=self._backend)
 
     def state_dict(self) -> dict[str, Any]:
         """The state, and what it belongs to: nested dicts of tensors and plain values, copied."""
@@ -221,8 +222,8 @@ class Trainer:
         plan = self.plan
         with state_errors():
             longer = check_saved(values, self._fingerprint, plan.config)
-            runs = next(x for x in BACKENDS if x.name == values["backend"]).runs_on(plan.device)
-            backend = resolve(values["backend"] if runs else "auto", plan.device)
+            runs = BACKENDS[values["backend"]].runs_on(plan.device)
+            backend = get_backend(values["backend"] if runs else "auto", plan.device).name
             decisions = Decisions.from_dict(values["decisions"])
             exposed = with_exposure(self._input_scene, decisions)
             plan = replace(Plan.of(plan.config, values["init"]["points"], decisions), backend=backend)
@@ -290,8 +291,8 @@ class Trainer:
         background = self._background
         if config.training_background == "random":
             background = torch.rand(3, generator=state.colors, dtype=torch.float32, device=self.plan.device)
-            view = view.over_background(background, self.plan.backend)
-        gaussians = state.model(backend=self.plan.backend)
+            view = view.over_background(background, self._backend)
+        gaussians = state.model(backend=self._backend)
         rendering: Any = self.render_view(gaussians, camera, view.background_before_gain(background))
         if rendering.projected.means2d.requires_grad:
             rendering.projected.means2d.retain_grad()  # for the densifier

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from kgs._support.errors import ArgumentError
-from kgs.backends.base import CompositingCall
+from kgs.backends import Backend, get_backend
 from kgs.projection import normals
 from kgs.renderer import blend
-from kgs.stages import composite_call, project
+from kgs.stages import project, rasterize
 from kgs.types import ProjectedGaussians, RasterOptions, check_tensor
 
 from .arguments import check_words, refuse
@@ -71,7 +71,7 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
     alpha_threshold: float = RasterOptions.alpha_threshold,
     transmittance_stop: float = RasterOptions.transmittance_stop,
     max_bytes: int | None = RasterOptions.max_bytes,
-    backend: str = "auto",
+    backend: str | Backend = "auto",
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render N Gaussians in C cameras; a drop-in for `gsplat.rasterization` of gsplat 1.6, and of 1.5 by name.
 
@@ -182,9 +182,8 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
     batch, count, n = shape
     views = (viewmats, Ks, (height, width), camera_model, pixel_centers, shape)
     scenes = split(means, quats, scales, covars, opacities, colors, extra_signals, sh_degree, *views)
-    projected = [
-        project(s.gaussians, s.cameras, options=options, colors=bool(s.widths), backend=backend) for s in scenes
-    ]
+    table = get_backend(backend, means.device)
+    projected = [project(s.gaussians, s.cameras, options=options, colors=bool(s.widths), backend=table) for s in scenes]
     pairs = Pairs(projected, batch, count, n, packed)
     half = 0.5 if pixel_centers == "half" else 0.0
     means2d = pairs.spread(joined([p.means2d for p in projected]) + half)
@@ -194,11 +193,11 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
         features = _features(scene, projected[b], render_mode.endswith("D"), return_normals)
         values = torch.cat(list(features.values()), 1)
         hook = absgrad_hook(means2d, pairs.rows(b)) if absgrad else None
-        composited.append(composite_call(CompositingCall(projected[b], values, options), backend, hook))
+        composited.append(rasterize(projected[b], values, options, table, absgrad_hook=hook))
     transmittance = joined([x.transmittance for x in composited])
     widths = [x.shape[1] for x in features.values()]
     sums = dict(zip(features, joined([x.features for x in composited]).split(widths, 1), strict=True))
-    images = _over(sums, transmittance, backgrounds, (*batch, count), backend)
+    images = _over(sums, transmittance, backgrounds, (*batch, count), table)
     alphas = 1.0 - transmittance
     if "depth" in sums:
         images["depth"] = sums["depth"] / alphas.clamp_min(1e-10) if render_mode.endswith("ED") else sums["depth"]
@@ -230,7 +229,7 @@ def _features(scene: Scene, projected: ProjectedGaussians, depth: bool, normal: 
 
 
 def _over(
-    sums: dict[str, Tensor], transmittance: Tensor, backgrounds: Tensor | None, batch: tuple[int, ...], backend: str
+    sums: dict[str, Tensor], transmittance: Tensor, backgrounds: Tensor | None, batch: tuple[int, ...], backend: Backend
 ) -> dict[str, Tensor]:
     """The image and the extra signals over their background; `batch` are the leading dimensions of `backgrounds`."""
     names = [name for name in ("image", "extra") if name in sums]

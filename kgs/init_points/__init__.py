@@ -11,6 +11,7 @@ from kgs._support.errors import ArgumentError, quoted, warn
 from kgs._support.machine import check_device
 from kgs._support.progress import ProgressBar, silent
 from kgs._support.shown import ShownByShapes
+from kgs.backends import check_backend
 from kgs.datasets.scene import Views
 from kgs.geometry import ViewGeometry
 from kgs.types import check_kind
@@ -102,6 +103,7 @@ def initial_points(
     if count is not None and count < 1:
         raise ArgumentError("count", "at least 1", count)
     where = check_device(str(device))
+    check_backend(backend)
     if kind == "file":
         if file is None:
             raise ArgumentError("file", "a path for the kind 'file'", "None")

@@ -4,7 +4,7 @@ import torch
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 
-from kgs.backends import takes_kernels
+from kgs.backends import Backend
 
 MAX_LINE_DISTANCE = 1.5  # pixels, from an epipolar line
 MAX_RATIO = 0.8  # of the best descriptor distance to the second best
@@ -12,7 +12,7 @@ MAX_DISTANCE = 0.4  # between descriptors of length 1, for matches without a sec
 
 
 def match(
-    lines: Tensor, pixels: Tensor, descriptors1: Tensor, descriptors2: Tensor, backend: str = "auto"
+    lines: Tensor, pixels: Tensor, descriptors1: Tensor, descriptors2: Tensor, backend: Backend
 ) -> tuple[Tensor, ...]:
     """Descriptor distances, and indices of the keypoints in the first and second view, each `(K,)`, of K matches.
 
@@ -21,9 +21,9 @@ def match(
         pixels: of the second view's keypoints, `(M, 2)`.
         descriptors1: of length 1, `(N, F)`.
         descriptors2: `(M, F)`.
-        backend: "numba" and "auto" use kernels if possible; the matches are the same.
+        backend: by numba's kernels or by torch; the matches are the same.
     """
-    if not takes_kernels(backend, "matching", lines):
+    if backend.covering("matching", lines).name != "numba":
         return _torch_matches(lines, pixels, descriptors1, descriptors2)
     from .matching_kernels import mutual_nearest
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from kgs._support.errors import ArgumentError
 from kgs._support.progress import ProgressBar, silent
+from kgs.backends import get_backend
 from kgs.datasets.scene import Views
 from kgs.geometry import ViewGeometry
 
@@ -62,13 +63,14 @@ def sweep_depths(
     spacing = max((1 / near - 1 / far) / (planes - 1), 1 / near / (MAX_TO_INFINITY - 2))
     inverse = 1 / near - spacing * torch.arange(math.ceil(1 / near / spacing) + 2, dtype=torch.float64, device="cpu")
     geometry = ViewGeometry.of(views.cameras)
+    kernels = get_backend(backend, device, required=False)
     memory = grey.new_empty(2, *grey.shape[1:], len(inverse)) if device.type == "cpu" else None
     maps = []
     for view in bar(range(len(views)), "depth maps", "view"):
         others = _neighbours(geometry, view, typical)
         if others:
             homographies = torch.stack([_homographies(geometry, view, other, inverse) for other in others])
-            costs, unsmoothed = sweep_costs(grey[view], grey[others], homographies.to(device), backend, memory)
+            costs, unsmoothed = sweep_costs(grey[view], grey[others], homographies.to(device), kernels, memory)
             maps.append(_refine(costs, unsmoothed, inverse, FARTHEST * far))
         else:
             unknown = torch.full_like(grey[view], -1.0, device="cpu")

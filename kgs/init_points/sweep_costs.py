@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kgs.backends import takes_kernels
+from kgs.backends import Backend
 
 WINDOW = 7  # pixels, the side of the patches that are compared
 # Prices of the smoothing, in units of 1 - NCC: of a step by one plane, and of a jump where the image has no edge.
@@ -25,7 +25,7 @@ VARIANCE = 1e-5  # added to that of a patch, in squared grey values, so that noi
 
 
 def sweep_costs(
-    image: Tensor, others: Tensor, homographies: Tensor, backend: str = "auto", memory: Tensor | None = None
+    image: Tensor, others: Tensor, homographies: Tensor, backend: Backend, memory: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Smoothed costs of each plane and pixel, and the costs before, 1 minus the scores; each `(D, H, W)`.
 
@@ -33,13 +33,13 @@ def sweep_costs(
         image: grey, float32, `(H, W)`.
         others: images of the neighbours, `(N, H, W)`, on its device, as all that follow.
         homographies: from pixels of `image` to those of a neighbour, by planes, float64, `(N, D, 3, 3)`.
-        backend: "numba" and "auto" use kernels if possible: on a CPU.
+        backend: by numba's kernels, on a CPU, or by torch.
         memory: float32 `(2, H, W, D)`, for the results of kernels, which is faster than new memory for each view.
     """
     middle = image.mean()  # without it, sums over windows are more exact
     image = image - middle
     others = others - middle
-    if takes_kernels(backend, "sweep", image):
+    if backend.covering("sweep", image).name == "numba":
         memory = torch.empty(2, *image.shape, homographies.shape[1]) if memory is None else memory
         return _compiled_costs(image, others, homographies, *memory)
     moments = _moments(image)

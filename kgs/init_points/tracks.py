@@ -15,6 +15,7 @@ from kornia.geometry.epipolar import fundamental_from_projections
 from torch import Tensor
 
 from kgs._support.progress import ProgressBar, silent
+from kgs.backends import get_backend
 from kgs.datasets.scene import Views
 from kgs.init_points.keypoints import root_sift
 
@@ -47,12 +48,13 @@ def find_tracks(views: Views, bar: ProgressBar = silent, backend: str = "auto") 
     features = [detect(views, view, limit) for view in bar(range(len(views)), "keypoints", "view")]
     projections = (views.cameras.intrinsics.double() @ views.cameras.extrinsics.double())[:, :3].cpu()
     nodes, pixels, owners = _distinct_pixels([pixels for pixels, _ in features])
+    kernels = get_backend(backend, pixels.device, required=False)
     links = list[tuple[float, int, int]]()
     for i, j in bar(list(combinations(range(len(views)), 2)), "matches", "pair"):
         pixels1, descriptors1 = features[i]
         pixels2, descriptors2 = features[j]
         lines = _lines(pixels1, projections[i], projections[j])
-        distances, rows, columns = match(lines, pixels2.float(), descriptors1, descriptors2, backend)
+        distances, rows, columns = match(lines, pixels2.float(), descriptors1, descriptors2, kernels)
         links += zip(distances.tolist(), nodes[i][rows].tolist(), nodes[j][columns].tolist(), strict=True)
     tracks = _join(links, owners)
     track_pixels = torch.zeros(len(tracks), len(views), 2, dtype=torch.float64)

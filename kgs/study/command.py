@@ -11,6 +11,7 @@ import tyro
 from kgs._support.errors import ArgumentError, DataError, quoted
 from kgs.app.cli.options import IfGiven, Out
 from kgs.app.cli.tools import check_installed, load_tools
+from kgs.app.files.results import Results
 from kgs.fit.config import FitConfig
 
 
@@ -71,13 +72,8 @@ def study(
             be overwritten.
         ValueError: the preset has no such fits, `table` is not of this preset, or `steps` is out of its range.
     """
-    from kgs.app.files.outputs import check_folder
-    from kgs.app.files.publishing import check_free, replacing
     from kgs.metrics.weights import weight_files
 
-    check_folder(out, make=False)
-    reports = {"guard": ("guard.md", "guard.jsonl"), "beyond": ("beyond.md",)}
-    check_free(out, "study", reports.get(preset, ("sparse.csv", "sparse.md", "index.html")))
     if table is not None and preset != "paper":
         raise ArgumentError("table", "the preset 'paper', which has the tables", quoted(preset))
     FitConfig(steps=steps)
@@ -124,18 +120,20 @@ def study(
         data=None if data is None else os.path.abspath(data),
         lpips_weights=None if lpips_weights is None else os.path.abspath(lpips_weights),
     )
-    try:
-        if not report_only:
-            run_grid(chosen, work, path, scheduler=scheduler, processes=processes, name=presets.name_of)
-    finally:
-        rows = finished_rows(cells, path)
-        if rows and not isinstance(sys.exception(), ValueError):  # another run may be writing its own
-            folder = "" if preset == "quick" or data is None else "KGS_DATA=SCENES "
-            options = same if lpips_weights is None else f"{same} --lpips-weights WEIGHTS"
-            with replacing(out, "study") as new:
-                text = write(rows, new, f"{folder}kgs study {options} -o OUT", len(cells))
-            if preset == "guard":
-                print(text)
+    with Results.open(out, "study", marks=("sparse.jsonl", "beyond.jsonl")) as results:
+        results.begin()
+        try:
+            if not report_only:
+                run_grid(chosen, work, path, scheduler=scheduler, processes=processes, name=presets.name_of)
+        finally:
+            rows = finished_rows(cells, path)
+            if rows and not isinstance(sys.exception(), ValueError):  # then no cell was done
+                folder = "" if preset == "quick" or data is None else "KGS_DATA=SCENES "
+                options = same if lpips_weights is None else f"{same} --lpips-weights WEIGHTS"
+                with results.stage(keep=True) as new:
+                    text = write(rows, new, f"{folder}kgs study {options} -o OUT", len(cells))
+                if preset == "guard":
+                    print(text)
     return int(len(finished_rows(chosen, path)) < len(chosen))
 
 

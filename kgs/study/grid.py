@@ -17,7 +17,6 @@ from distributed import Client, KilledWorker, LocalCluster, Security, as_complet
 from distributed.core import rpc
 
 from kgs._support.errors import ArgumentError, DataError, quoted
-from kgs.app.files.locks import held
 
 from .running import Running
 
@@ -48,7 +47,7 @@ def run_grid(
     Args:
         cells: dicts of plain values, each different.
         work: a function of a module (other processes import it): takes a cell, returns its result in plain values.
-        path: JSONL file; gets a line `{"cell": ..., "result": ...}` as soon as a cell is done.
+        path: JSONL file that no other run writes; gets a line `{"cell": ..., "result": ...}` as soon as a cell is done.
         processes: how many processes of this machine do the cells, None for one per core; they share the cores.
         scheduler: address of a Dask scheduler, whose workers do the cells instead; they need the same packages and
             data.
@@ -57,19 +56,19 @@ def run_grid(
 
     Raises:
         ArgumentError: two cells are equal, `processes` is below 1, or the scheduler does not answer or was lost.
-        DataError: another run writes the file, or a line of it is wrong.
+        DataError: a line of the file is wrong.
     """
     if processes is not None and processes < 1:
         raise ArgumentError("processes", "at least 1", processes)
     if len({_key(cell) for cell in cells}) < len(cells):
         raise ArgumentError("cells", "each one once", "two that are equal")
-    with _alone(path):
-        done = {_key(row["cell"]) for row in read_rows(path, repair=True)}
-        missing = [cell for cell in cells if _key(cell) not in done]
-        say(f"{len(cells) - len(missing)} of {len(cells)} cells are there, {len(missing)} to do")
-        if missing:
-            with _client(processes, scheduler) as client, Running.of(client) as running:
-                _do(client, work, missing, path, partial(_say_aside, running, say), name, running)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    done = {_key(row["cell"]) for row in read_rows(path, repair=True)}
+    missing = [cell for cell in cells if _key(cell) not in done]
+    say(f"{len(cells) - len(missing)} of {len(cells)} cells are there, {len(missing)} to do")
+    if missing:
+        with _client(processes, scheduler) as client, Running.of(client) as running:
+            _do(client, work, missing, path, partial(_say_aside, running, say), name, running)
     return finished_rows(cells, path)
 
 
@@ -239,13 +238,3 @@ def finished_rows(cells: Sequence[Cell], path: Path) -> list[dict[str, Any]]:
     """The lines of the cells that the file has, in the cells' order; where a cell has two lines, the last."""
     done = {_key(row["cell"]): row for row in read_rows(path)}
     return [done[key] for key in map(_key, cells) if key in done]
-
-
-@contextmanager
-def _alone(path: Path) -> Iterator[None]:
-    """Keep other runs from writing the file, which is created if it is not there."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with held(path) as ours:
-        if not ours:
-            raise DataError(path, "", "no other run that writes this file", "one")
-        yield

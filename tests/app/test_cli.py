@@ -24,10 +24,8 @@ from kgs._support.json_files import write_json
 from kgs.app.cli.fit import first_config
 from kgs.app.cli.run import COMMANDS, load_command
 from kgs.app.cli.tools import explain_import_error, load_package, load_tools
-from kgs.app.files.locks import locked
-from kgs.app.files.outputs import EXPORTS, FILMS
-from kgs.app.files.publishing import UNFINISHED, replacing
-from kgs.app.files.results_folder import CHECKPOINT, PREVIOUS
+from kgs.app.files.fit_files import CHECKPOINT, EXPORTS, FILMS, PREVIOUS
+from kgs.app.files.results import Results
 from kgs.errors import ArgumentError, DataError, PhotosRefused, TrainingDiverged
 from kgs.fit.config import DETAILS, DROP, PAPER, PRESETS, FitConfig
 
@@ -88,12 +86,6 @@ def test_render_gives_the_pictures_of_fit(fitted, folder, tmp_path):
         assert np.abs(one - two).max() <= 1
 
 
-def write_as_kgs(path, values):
-    """Write a file of a fit, and enter it in the marker."""
-    with replacing(path.parent, "fit") as new:
-        write_json(new / path.name, values)
-
-
 @pytest.fixture
 def copied(fitted, tmp_path):
     """The results, for this test alone."""
@@ -109,7 +101,7 @@ def test_eval_measures_the_same_and_keeps_the_rest(copied, capsys):
     before["peak_rss_mb"] = 1
     wrong = json.loads(json.dumps(before))
     wrong["test"]["psnr"] = wrong["train"]["views"][0]["ssim"] = 1.0
-    write_as_kgs(path, wrong)
+    write_json(path, wrong)
     assert run("eval", copied) == 0
     assert json.loads(path.read_text()) == before
     assert "PSNR" in capsys.readouterr().out
@@ -119,7 +111,7 @@ def test_eval_refuses_measures_of_other_views(copied, capsys):
     path = copied / "metrics.json"
     metrics = json.loads(path.read_text())
     metrics["test"]["views"][0]["name"] = "another"
-    write_as_kgs(path, metrics)
+    write_json(path, metrics)
     assert run("eval", copied) == 3
     assert ", got others: fit again" in one_line(capsys)
     assert json.loads(path.read_text()) == metrics
@@ -135,13 +127,14 @@ def test_resume_of_a_finished_fit_changes_nothing_and_with_other_numbers_is_refu
 
 
 def test_a_fit_at_work_is_not_called_unfinished(folder, tmp_path, capsys):
-    (tmp_path / UNFINISHED).mkdir()
-    (tmp_path / UNFINISHED / CHECKPOINT).touch()
-    with locked(tmp_path):
+    with Results.open(tmp_path, "fit") as results:
+        results.begin()
+        results.work.mkdir()
+        (results.work / CHECKPOINT).touch()
         assert run("fit", folder, "-o", tmp_path) == 3
-        assert "no kgs at work on the fit in this folder, got one" in one_line(capsys)
+        assert "kgs is at work" in one_line(capsys)
     assert run("fit", folder, "-o", tmp_path) == 3
-    assert "go on with it by --resume, or remove this folder" in one_line(capsys)
+    assert "use --resume, or remove it" in one_line(capsys)
 
 
 def test_a_newline_in_a_folders_name_is_escaped(tmp_path, capsys):

@@ -111,7 +111,7 @@ MISTAKES = [  # words, what is said of them, and a package that is not installed
     ("fit photos -o out --downscale 0.5", "--downscale: expected", ""),
     ("fit photos -o out --hold-out 1", "--hold-out: expected", ""),
     ("fit photos -o out --lpips-weights empty", "empty/vgg16_features.npz: expected", ""),
-    ("fit photos -o photos", "photos: expected a folder for results, got photos or files of a scene", ""),
+    ("fit photos -o photos", "photos: expected a new or empty folder", ""),
     ("fit missing -o out", "missing: expected a file or folder, got none", ""),
     ("fit empty -o out", "empty: expected photos", ""),
     (

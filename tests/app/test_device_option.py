@@ -2,6 +2,8 @@
 
 import inspect
 import logging
+from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -11,39 +13,27 @@ from kgs import backends
 from kgs._support.json_files import read_json, write_json
 from kgs.app.cli import tools
 from kgs.app.cli.run import COMMANDS, load_command
-from kgs.app.files.publishing import UNFINISHED
-from kgs.app.files.results_folder import CHECKPOINT
+from kgs.app.files.fit_files import CHECKPOINT, UNFINISHED
+from kgs.app.files.results import MARKER
 
 QUICK = ("--init", "random", "--init-points", 30, "--evaluations", 1)
 
 
 @pytest.fixture
 def card(monkeypatch):
-    """A machine with a GPU, kernels for it that are installed and trusted, and numba, by these attributes."""
+    """A machine with a GPU: which packages it has, and whether its kernels are trusted."""
 
-    class Numba(backends.TorchBackend):
-        name, devices, package = "numba", ("cpu",), ("numba", "fast")
-        is_there = True
-
-        def is_installed(self):
-            return self.is_there
-
-    class Triton(backends.TorchBackend):
-        name, devices, package = "triton", ("cuda",), ("triton", "torch brings it")
-        is_there = is_right = True
-
-        def is_installed(self):
-            return self.is_there
-
-        def is_trusted(self, device):
-            return self.is_right
-
-    numba, triton = Numba(), Triton()
-    monkeypatch.setattr(backends, "BACKENDS", (numba, triton, backends.TorchBackend()))
+    machine = SimpleNamespace(packages={"numba", "triton"}, trust=lambda _: True)
+    torchs = backends.BACKENDS["torch"]
+    numba = replace(torchs, name="numba", devices=("cpu",), package=("numba", "fast"))
+    triton = replace(torchs, name="triton", devices=("cuda",), package=("triton", "torch brings it"))
+    triton = replace(triton, is_trusted=lambda device: machine.trust(device))
+    monkeypatch.setattr(backends, "BACKENDS", {"numba": numba, "triton": triton, "torch": torchs})
+    monkeypatch.setattr("kgs.backends.table._is_found", lambda package: package in machine.packages)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "Card 9000")
     monkeypatch.setattr("kgs._support.machine.check_device", torch.device)
-    return numba, triton
+    return machine
 
 
 @pytest.mark.parametrize(
@@ -60,9 +50,9 @@ def card(monkeypatch):
     ],
 )
 def test_auto_takes_a_gpu_for_which_there_are_kernels(card, backend, numba, kernels, taken, said, capsys):
-    card[0].is_there = numba
-    card[1].is_right = kernels == "right"
-    card[1].is_there = kernels != "missing"
+    there = {"numba": numba, "triton": kernels != "missing"}
+    card.packages = {package for package, is_there in there.items() if is_there}
+    card.trust = lambda _: kernels == "right"
     assert tools.load_tools("auto", backend).type == taken
     lines = capsys.readouterr().err
     assert lines.startswith(said)
@@ -86,7 +76,7 @@ def test_auto_is_the_cpu_without_a_gpu_and_with_one_that_cannot_be_used(card, mo
 def test_a_line_of_a_command_says_why_the_first_use_of_a_gpu_takes_long(card, monkeypatch, capsys):
     log = logging.getLogger("kgs")
     before = log.level, list(log.handlers)
-    monkeypatch.setattr(card[1], "is_trusted", lambda _: log.info("compiling: %d of %d", 12, 27) or True)
+    card.trust = lambda _: log.info("compiling: %d of %d", 12, 27) or True
     tools.load_tools("auto")
     assert capsys.readouterr() == ("", "")  # of the library
     monkeypatch.setitem(COMMANDS, "check", lambda: tools.load_tools("cuda") and 0)
@@ -126,9 +116,10 @@ def test_a_fit_of_a_cpu_goes_on_there_where_there_is_a_gpu_too(
     if begun is not None:
         (work / CHECKPOINT).touch()
         write_json(work / "config.json", {"fit": {"device": begun}})
-    monkeypatch.setattr("kgs.app.files.results_folder.check_fit_files", lambda *_: None)
+    write_json(work.parent / MARKER, {"files": {}})
     monkeypatch.setattr("kgs.app.fit_folder.fit_folder", lambda *_, **__: (_ for _ in ()).throw(SystemExit(7)))
     for options, expected in ((("--resume",), taken), (("--resume", "--device", "cuda"), "cuda"), ((), "cuda")):
-        assert run("fit", folder, "-o", tmp_path / "out", *options, *QUICK) == 7
+        out = tmp_path / ("out" if "--resume" in options else "new")
+        assert run("fit", folder, "-o", out, *options, *QUICK) == 7
         named = capsys.readouterr().out.splitlines()[0]
         assert named.startswith("device: CPU, " if expected == "cpu" else "device: Card 9000 (cuda)")

@@ -21,9 +21,9 @@ from kgs._support.json_files import write_json
 from kgs.app.cli.render import render
 from kgs.app.files import exports
 from kgs.app.files.cameras import camera_list, upright
-from kgs.app.files.outputs import EXPORTS
+from kgs.app.files.fit_files import EXPORTS
 from kgs.app.files.preview import write_preview
-from kgs.app.files.publishing import is_own, replacing
+from kgs.app.files.results import Results
 from kgs.datasets import Scene
 from kgs.fit import Fit
 from kgs.geometry import typical_depths
@@ -131,17 +131,17 @@ def test_one_film_takes_the_place_of_the_other(fit: Fit, tmp_path: Path, monkeyp
     pytest.importorskip("av")
 
     def publish() -> list[str]:
-        with replacing(tmp_path, "fit", all_former=True) as new:
+        with Results.open(tmp_path / "out", "fit") as results, results.stage() as new:
             exports.write_exports(fit, new)
-        return sorted(path.name for path in tmp_path.glob("turntable.*"))
+        return sorted(path.name for path in (tmp_path / "out").glob("turntable.*"))
 
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "av", None)
         assert publish() == ["turntable.webm"]
     assert publish() == ["turntable.mp4"]
-    (tmp_path / "turntable.webm").write_bytes(b"mine")
+    (tmp_path / "out" / "turntable.webm").write_bytes(b"mine")
     assert publish() == ["turntable.mp4", "turntable.webm"]
-    assert (tmp_path / "turntable.webm").read_bytes() == b"mine"
+    assert (tmp_path / "out" / "turntable.webm").read_bytes() == b"mine"
 
 
 @pytest.mark.parametrize("background", ["black", "white"])
@@ -165,7 +165,6 @@ def test_a_png_with_alpha_over_a_background_is_the_opaque_one(folder: Path, tmp_
         assert share.max() > 0.5
         composed = share * clear[:, :, :3] + (1 - share) * (255 if background == "white" else 0)
         assert np.abs(composed - opaque).max() <= 1.6  # three values, each rounded to 8 bits
-        assert is_own(tmp_path / "clear", name)
 
 
 def test_the_film_leaves_out_what_is_right_before_its_camera(fit: Fit, tmp_path: Path, monkeypatch: Any) -> None:

@@ -1,4 +1,4 @@
-"""Files for the user: names of their own, and folders that cannot be used are found before any work."""
+"""Files for the user have names of their own, and are written whole."""
 
 import json
 import os
@@ -7,10 +7,8 @@ import cv2
 import pytest
 import torch
 
-from kgs._support.errors import DataError
 from kgs._support.json_files import write_json, write_whole
-from kgs.app.files.outputs import check_folder, png_names, write_png
-from kgs.app.files.publishing import replacing
+from kgs.app.files.outputs import png_names, write_png
 
 
 def test_each_view_has_a_picture_of_its_own():
@@ -31,43 +29,6 @@ def test_a_png_keeps_its_pixels_also_under_a_long_name(tmp_path):
     write_png(tmp_path / name, image)
     pixels = cv2.cvtColor(cv2.imread(str(tmp_path / name)), cv2.COLOR_BGR2RGB)
     assert torch.equal(torch.from_numpy(pixels).permute(2, 0, 1), (image * 255).round().byte())
-
-
-def test_no_results_among_the_files_of_a_scene(tmp_path):
-    scene = tmp_path / "scene"
-    (scene / "images").mkdir(parents=True)
-    (scene / "poses_bounds.npy").write_bytes(b"")
-    (scene / "images" / "photo.JPG").write_bytes(b"")
-    for out in (scene, scene / "images", tmp_path / "." / "scene" / "images"):
-        with pytest.raises(DataError, match="files of a scene"):
-            check_folder(out, scene)
-    with pytest.raises(DataError, match="files of a scene"):
-        check_folder(scene, tmp_path / "another scene")
-    check_folder(scene / "results", scene)
-    with replacing(scene / "results", "renders") as new:
-        write_png(new / "a.png", torch.zeros(3, 4, 5))
-    check_folder(scene / "results", scene)  # again: those pictures are kgs's
-
-
-@pytest.mark.parametrize("name", ["file", "file/below", "file/below/that", "dangling"])
-def test_a_folder_that_cannot_be_is_found_at_once(tmp_path, name):
-    (tmp_path / "file").write_text("")
-    (tmp_path / "dangling").symlink_to(tmp_path / "nowhere")
-    with pytest.raises(DataError, match="expected a folder for results"):
-        check_folder(tmp_path / name)
-
-
-def test_a_folder_without_permission_is_found_at_once(tmp_path, monkeypatch):
-    monkeypatch.setattr("os.access", lambda *_: False)  # tests may run as root, who has every permission
-    with pytest.raises(DataError, match="no permission for"):
-        check_folder(tmp_path / "new")
-
-
-def test_looking_makes_nothing(tmp_path):
-    check_folder(tmp_path / "new" / "folder", make=False)
-    assert os.listdir(tmp_path) == []
-    check_folder(tmp_path / "new" / "folder")
-    assert os.listdir(tmp_path / "new") == ["folder"]
 
 
 def test_files_are_whole_or_as_they_were(tmp_path, monkeypatch):

@@ -153,7 +153,6 @@ def test_the_report_says_what_was_found(posed):
     assert sorted(path.name for path in out.iterdir()) == [
         ".kgs.json",
         ".kgs.lock",
-        ".lock",
         "images",
         "photos.json",
         "sparse",
@@ -177,7 +176,7 @@ def test_the_same_photos_and_seed_give_the_same_files(posed, tmp_path):
 
 def test_a_second_run_uses_what_is_there(posed):
     folder, out, _, _ = posed
-    lines, before = [], {path: path.stat().st_mtime_ns for path in out.rglob("*.*") if path.name != ".lock"}
+    lines, before = [], {path: path.stat().st_mtime_ns for path in out.rglob("*.*") if path.name != ".kgs.lock"}
     assert pose_photos(folder, out, say=lines.append)["reused"]
     assert "used again" in lines[0]
     assert {path: path.stat().st_mtime_ns for path in before} == before

@@ -9,20 +9,19 @@ import sys
 import cv2
 import numpy as np
 import pytest
-import torch
 from command import run as command
 from init_point_scenes import cameras, texture
 from limits import limited
-from photo_folders import close, exif, planes, with_exif, write_photos, write_planes
+from photo_folders import close, planes, write_photos, write_planes
 
 from kgs._support.errors import DataError
 from kgs._support.progress import silent
-from kgs.app.files.outputs import write_png
-from kgs.app.files.publishing import publish, replacing
+from kgs.app.files.results import Results
 from kgs.app.sfm import pose, pose_photos
-from kgs.app.sfm.find import find_photos, notes_on
+from kgs.app.sfm.find import find_photos
 from kgs.app.sfm.pycolmap_processes import PycolmapProcesses
-from kgs.app.sfm.read import blurred, open_photos, read_photos, sharpness
+from kgs.app.sfm.read import open_photos, read_photos
+from kgs.app.sfm.source import Source
 
 pytest.importorskip("pycolmap")
 
@@ -143,7 +142,7 @@ def test_a_raw_file_beside_its_photo_is_passed_over(folder, heic, monkeypatch):
     for name in ("0.DNG", "1.dng", "2.HEIC"):
         (folder / name).write_bytes(b"II*\0")
     assert [path.name for path in find_photos(folder)] == ["0.png", "1.png", "2.png"]
-    said = " ".join(notes_on(folder))
+    said = " ".join(Source.unposed(folder).notes(None))
     for name in ("0.DNG", "1.dng", "2.HEIC"):
         assert name in said
 
@@ -156,7 +155,7 @@ def test_a_photo_is_taken_whatever_its_ending_is_called(folder, suffix):
     paths = find_photos(folder)
     assert paths[-1].name == f"3.{suffix}"
     assert len(read_photos(open_photos(paths), silent)) == 4
-    assert not notes_on(folder)
+    assert not Source.unposed(folder).notes(None)
 
 
 @pytest.mark.parametrize("suffix", ["avif", "JXL", "jp2", "gif", "pef", "ppm", "mpo"])
@@ -182,7 +181,7 @@ def test_what_looks_like_a_photo_and_is_not_taken_is_named(folder, refused):
     said = refused(folder.rename(folder.with_name("none")), "these folders in it hold some: more", "IMG_4", code=3)
     fill_with_odd_ones(save(folder, planes()))
     assert [path.name for path in find_photos(folder)] == ["0.png", "1.png", "2.png"]
-    said = " ".join(notes_on(folder))
+    said = " ".join(Source.unposed(folder).notes(None))
     for name in ("IMG_4", ".IMG_5.jpg", "IMG_6.jpg_original", "IMG_9.jpg", "more", "IMG_8.xmp"):
         assert name in said
     for name in ("IMG_7", "notes", "BM.txt", "empty"):
@@ -200,46 +199,8 @@ def test_masks_are_used_and_what_looks_like_one_is_no_photo(folder):
     photos = read_photos(open_photos(paths), silent)
     np.testing.assert_array_equal(photos[0].mask, mask)
     assert photos[1].mask is None
-    (note,) = notes_on(folder)
+    (note,) = Source.unposed(folder).notes(None)
     assert "1_mask.png" in note
-
-
-@pytest.mark.parametrize("stored", [False, True])
-def test_a_mask_is_upright_or_as_the_photo_is_stored(tmp_path, stored):
-    """Of a photo that its Exif turns by 90 degrees."""
-    upright = planes()[0]
-    jpeg = cv2.imencode(".jpg", np.rot90(upright))[1].tobytes()
-    (tmp_path / "a.jpg").write_bytes(with_exif(jpeg, exif(orientation=6)))
-    (tmp_path / "masks").mkdir()
-    mask = np.full((180, 240), 255, np.uint8)
-    mask[:, :40] = 0
-    cv2.imwrite(str(tmp_path / "masks" / "a.png"), np.rot90(mask) if stored else mask)
-    (photo,) = read_photos(open_photos([tmp_path / "a.jpg"], tmp_path / "masks"), silent)
-    assert photo.size == (240, 180)
-    assert np.array_equal(photo.mask, mask)
-
-
-@pytest.mark.parametrize("kind", ["alpha", "mask", "both"])
-def test_a_colour_that_is_hidden_does_not_show_in_a_reduced_photo(tmp_path, kind):
-    """One colour is seen, another is hidden: at the border only the first one shows."""
-    height, width = 1700, 1900
-    y, x = np.mgrid[:height, :width]
-    hidden = (np.hypot(x - 900, y - 850) < 501.3) | (x < 33)
-    image = np.where(hidden[..., None], np.uint8([0, 255, 0]), np.uint8([30, 60, 200]))
-    if kind != "mask":
-        image = np.dstack([image, np.where(hidden & (kind == "alpha") | (y > 1600), 0, 255).astype(np.uint8)])
-    cv2.imwrite(str(tmp_path / "a.png"), image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-    if kind != "alpha":
-        (tmp_path / "masks").mkdir()
-        cv2.imwrite(str(tmp_path / "masks" / "a.png"), np.where(hidden, 0, 255).astype(np.uint8))
-    masks = None if kind == "alpha" else tmp_path / "masks"
-    (photo,) = read_photos(open_photos([tmp_path / "a.png"], masks), silent)
-    seen = np.ones(photo.pixels.shape[:2], bool) if photo.mask is None else photo.mask > 0
-    if not photo.is_opaque:
-        seen &= photo.pixels[..., 3] > 0
-        assert not photo.pixels[photo.pixels[..., 3] == 0].any()
-    assert 0.5 < seen.mean() < 0.95
-    assert np.abs(photo.pixels[seen][:, :3].astype(int) - [200, 60, 30]).max() <= 1
 
 
 def test_what_is_called_like_masks_and_is_not_used_is_named(folder):
@@ -247,22 +208,11 @@ def test_what_is_called_like_masks_and_is_not_used_is_named(folder):
     lone = ["0 (mask).png", "0_seg.png", "9_mask.png", "mask.png"]
     save(folder, [planes()[0]] * 4, lone)
     assert len(find_photos(folder)) == 7
-    unused, taken = notes_on(folder)
+    unused, taken = Source.unposed(folder).notes(None)
     assert "segmentation" in unused
     assert "--masks" in unused
     assert ", ".join(lone) in taken
-    assert notes_on(folder, folder / "segmentation") == [taken]
-
-
-@pytest.mark.slow
-def test_two_scenes_in_one_folder(folder, refused):
-    save(folder, small([*planes()[:2], *planes()[:2, :, ::-1]]))
-    text = refused(folder, "2 groups that do not overlap (1: 0.png, 1.png; 2: 2.png, 3.png)", "If they show two scenes")
-    rows = [line.split() for line in text.splitlines()[-4:]]
-    assert [row[:2] for row in rows] == [["1", "0.png"], ["2", "1.png"], ["3", "2.png"], ["4", "3.png"]]
-    assert int(rows[0][3]) == int(rows[1][2]) > 50  # a table is symmetric
-    assert max(int(rows[i][j]) for i in (0, 1) for j in (4, 5)) < 30
-    assert rows[3][5] == "."
+    assert Source.open(folder).notes(folder / "segmentation") == [taken]
 
 
 def test_a_camera_that_only_turned(folder, refused):
@@ -284,72 +234,22 @@ def test_walking_forward(tmp_path, refused):
     assert "places between" not in text
 
 
-def test_a_blurred_photo_is_told(folder):
-    images = planes()
-    images[1] = cv2.GaussianBlur(images[1], (0, 0), 2.0)
-    save(folder, images)
-    assert [photo.path.name for photo in blurred(read_photos(open_photos(sorted(folder.iterdir())), silent))] == [
-        "1.png"
-    ]
-
-
-def test_what_a_mask_leaves_out_is_neither_sharp_nor_blurred(folder):
-    mask = np.full((180, 240), 255, np.uint8)
-    mask[40:140, 100:200] = 0
-    for hidden in (0, 255, np.random.default_rng(0).integers(0, 256, (180, 240, 3))):
-        image = np.where(mask[..., None] > 0, planes()[0], hidden).astype(np.uint8)
-        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        assert sharpness(grey, mask) == sharpness(cv2.cvtColor(planes()[0], cv2.COLOR_BGR2GRAY), mask)
-
-
-@pytest.mark.slow
-def test_photos_of_several_sizes_are_shrunk_to_the_smallest(folder):
-    save(folder, [planes()[0], *(cv2.resize(image, (480, 360)) for image in planes()[1:])])
-    photos = read_photos(open_photos(sorted(folder.iterdir())), silent)
-    assert {photo.size for photo in photos} == {(240, 180)}
-    large = cv2.resize(planes()[0], (2400, 1800))
-    save(folder, [large, large[::-1], large[:, ::-1]])
-    assert {photo.size for photo in read_photos(open_photos(sorted(folder.iterdir())), silent)} == {(1600, 1200)}
-
-
 def test_results_do_not_go_among_the_photos_or_over_another_scene(folder, tmp_path, refused):
     write_planes(folder)
-    (tmp_path / "scene" / "sparse").mkdir(parents=True)
-    (tmp_path / "scene" / "sparse" / "images.bin").write_bytes(b"mine")
     save(tmp_path / "other" / "images", planes())
-    for out, said in (
-        (folder, "of the photos|photos or files of a scene"),
-        (tmp_path / "scene", "files of a scene"),
-        (tmp_path / "other", "did not write"),
-    ):
-        refused(folder, "expected", out=out, code=3)
-        with pytest.raises(DataError, match=said):
-            pose_photos(folder, out)
+    for out in (folder, tmp_path / "other"):
+        before = sorted(out.rglob("*"))
+        refused(folder, "expected a new or empty folder", out=out, code=3)
+        assert sorted(out.rglob("*")) == before
 
 
-def test_photos_that_lie_where_results_go_are_refused(tmp_path, refused):
-    images = write_planes(tmp_path / "images")
-    refused(images, "another folder", out=tmp_path, code=3)
-    for path in images.iterdir():  # as renders of kgs are
-        write_png(path, torch.rand(3, 8, 8))
-    with replacing(images, "renders") as new:
-        for path in images.glob("*.png"):
-            shutil.copy(path, new)
+def test_photos_that_lie_where_results_go_are_refused(tmp_path, found):
+    pose_photos(write_planes(tmp_path / "photos"), tmp_path / "out")
+    images = tmp_path / "out" / "images"
+    before = {path.name: path.read_bytes() for path in images.iterdir()}
     with pytest.raises(DataError, match="another folder than that of the photos"):
-        pose_photos(images, tmp_path)
-    assert len(list(images.glob("*.png"))) == 3
-
-
-def test_a_users_photos_among_pictures_of_kgs_stay(folder, tmp_path):
-    """As where `kgs render` wrote into the folder of the photos."""
-    out = tmp_path / "project"
-    images = save(out / "images", planes()[:1], ["IMG_1.png"])
-    with replacing(images, "renders") as new:
-        write_png(new / "render.png", torch.rand(3, 8, 8))
-    before = (images / "IMG_1.png").read_bytes()
-    with pytest.raises(DataError, match="did not write"):
-        pose_photos(write_planes(folder), out)
-    assert (images / "IMG_1.png").read_bytes() == before
+        pose_photos(images, tmp_path / "out")
+    assert {path.name: path.read_bytes() for path in images.iterdir()} == before
 
 
 @pytest.fixture
@@ -364,6 +264,10 @@ def found(monkeypatch):
         (new / "sparse" / "0").mkdir(parents=True)
         for path in paths:
             (new / "images" / path.name).write_bytes(b"photo")
+        if any(photo.mask for photo in opened):
+            (new / "masks").mkdir()
+            for path in paths:
+                (new / "masks" / f"{path.name}.png").write_bytes(b"mask")
         for name in ("cameras", "images", "points3D"):
             (new / "sparse" / "0" / f"{name}.bin").write_bytes(bytes([len(paths)]))
         return {"photos": {path.name: {"image": path.name} for path in paths}, "versions": {"kgs": "0"}}
@@ -373,38 +277,28 @@ def found(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
-    [
-        *((f"{name}/deeper/IMG_1.HEIC", "") for name in ("images", "unfinished")),
-        *((name, "") for name in ("unfinished/notes.txt", "images/notes.txt", "checkpoint.safetensors")),
-        ("sparse/0/deeper/IMG_1.HEIC", "files of a scene"),
-        ("sparse/0/cameras.bin", "files of a scene"),
-        *((name, "did not write") for name in ("photos.json", "images", "images/1.png", "unfinished/photos.json")),
-    ],
+    "name", ["unfinished/notes.txt", "images/notes.txt", "images/deeper/IMG_1.HEIC", "sparse/0/deeper/a.bin", "a.jpg"]
 )
-def test_a_users_own_files_stay(folder, tmp_path, found, name, said):
-    """Also such as kgs does not read: HEIC photos, notes, checkpoints of another program."""
-    mine = tmp_path / "project" / name
-    mine.parent.mkdir(parents=True)
-    mine.write_bytes(b"mine")
-    if said:
-        with pytest.raises(DataError, match=said):
-            pose_photos(write_planes(folder), tmp_path / "project")
-        assert not found
-    else:
-        pose_photos(write_planes(folder), tmp_path / "project")
-        assert len(list((tmp_path / "project" / "images").glob("*.png"))) == 3
-    assert mine.read_bytes() == b"mine"
+def test_a_users_own_files_stay(folder, tmp_path, found, name):
+    """Also such as kgs does not read, when new photos take the place of the former ones."""
+    out = tmp_path / "project"
+    pose_photos(write_planes(folder), out)
+    (out / name).parent.mkdir(parents=True, exist_ok=True)
+    (out / name).write_bytes(b"mine")
+    (folder / "IMG_1.png").rename(folder / "IMG_4.png")
+    pose_photos(folder, out)
+    assert sorted(path.name for path in (out / "images").glob("*.png")) == ["IMG_2.png", "IMG_3.png", "IMG_4.png"]
+    assert (out / name).read_bytes() == b"mine"
 
 
-@pytest.mark.parametrize("lost", [".kgs.json", ""])
+@pytest.mark.parametrize("lost", [".kgs*", ""])
 def test_a_copy_of_the_results_goes_on(folder, tmp_path, found, lost):
     """Without hidden files, as `cp OUT/* COPY` makes it, nothing in it is known as a file of kgs: it is refused."""
     pose_photos(write_planes(folder), tmp_path / "out")
     copy = tmp_path / "copy"
     shutil.copytree(tmp_path / "out", copy, ignore=shutil.ignore_patterns(lost), copy_function=shutil.copyfile)
     if lost:
-        with pytest.raises(DataError, match=r"got photos\.json, images/IMG_1\.png, .*: move"):
+        with pytest.raises(DataError, match=r"got one with images, photos\.json, sparse"):
             pose_photos(folder, copy)
         return
     assert pose_photos(folder, copy)["reused"]
@@ -420,14 +314,14 @@ def test_other_masks_make_other_cameras(folder, tmp_path, found):
     assert not pose_photos(folder, tmp_path / "out")["reused"]
 
 
-def test_results_that_are_lost_are_made_again_and_changed_ones_refused(folder, tmp_path, found):
+def test_results_that_are_lost_are_made_again(folder, tmp_path, found):
     out = tmp_path / "out"
     pose_photos(write_planes(folder), out)
-    (out / "sparse" / "0" / "cameras.bin").unlink()
-    assert not pose_photos(folder, out)["reused"]
-    (out / "images" / "IMG_1.png").write_bytes(b"mine")
-    with pytest.raises(DataError, match=r"got images/IMG_1\.png: move"):
-        pose_photos(folder, out)
+    for name in ("sparse/0/cameras.bin", "images/IMG_1.png"):
+        (out / name).unlink()
+        assert not pose_photos(folder, out)["reused"]
+        assert (out / name).exists()
+    assert pose_photos(folder, out)["reused"]
 
 
 def test_new_cameras_wait_beside_the_fit_of_the_former_ones(folder, found):
@@ -439,23 +333,28 @@ def test_new_cameras_wait_beside_the_fit_of_the_former_ones(folder, found):
         """How many photos the published cameras are of."""
         return (out / "sparse" / "0" / "cameras.bin").read_bytes()[0], len(list((out / "images").iterdir()))
 
+    def pose_for_fit():
+        source = Source.open(folder)
+        with Results.open(out, "fit", ["photos"]) as results:
+            return pose.pose(source, results, seed=0, masks=None, frames=None, for_fit=True)
+
     assert pose_photos(write_planes(folder), out)["folder"] == str(out)
-    assert pose_photos(folder, out, wait=True)["folder"] == str(out)
+    assert pose_for_fit()["folder"] == str(out)
     assert published() == (3, 3)
     save(folder, planes()[:1, 20:], ["IMG_4.png"])
     for reused in (False, True):
-        report = pose_photos(folder, out, wait=True)
+        report = pose_for_fit()
         assert (report["reused"], report["folder"]) == (reused, str(waiting))
         assert len(report["photos"]) == 4
         assert published() == (3, 3)
     (folder / "IMG_4.png").unlink()
-    assert pose_photos(folder, out, wait=True)["folder"] == str(out)  # those of the fit after all
+    assert pose_for_fit()["folder"] == str(out)  # those of the fit after all
     (waiting / "checkpoint.safetensors").write_bytes(b"of a fit to the four")
     save(folder, planes()[:1, 20:40], ["IMG_5.png"])
-    with pytest.raises(DataError, match="a fit that is done, got one that is not"):
-        pose_photos(folder, out, wait=True)
-    (waiting / "checkpoint.safetensors").unlink()
-    publish(waiting, out)
+    with pytest.raises(DataError, match="one of other photos"):
+        pose_for_fit()
+    with Results.open(out, "fit", ["photos"]) as results:
+        results.publish("fit", "photos")
     assert published() == (4, 4)
     assert not waiting.exists()
     assert found == [3, 4]
@@ -475,7 +374,7 @@ def test_a_full_disk_and_ctrl_c_leave_nothing_behind(folder, monkeypatch, refuse
 
     monkeypatch.setattr(f"kgs.app.sfm.{stage}", fail)
     refused(write_planes(folder), said, code=code)
-    assert all(path.name in (".lock", ".kgs.lock") for path in (folder.parent / "out").iterdir())
+    assert not (folder.parent / "out").exists()
 
 
 @pytest.mark.slow
@@ -487,7 +386,7 @@ def test_a_disk_that_is_full_when_a_database_is_written(folder, refused, size):
     assert said[-1].startswith(f"kgs: {folder.parent}/out/")
     assert said[-1].endswith(": File too large")
     assert all(" of 3 " in line for line in said[:-1])  # how far the work was
-    assert all(path.name in (".lock", ".kgs.lock") for path in (folder.parent / "out").iterdir())
+    assert not (folder.parent / "out").exists()
 
 
 @pytest.mark.slow
@@ -502,7 +401,7 @@ def test_ctrl_c_while_keypoints_are_matched(folder, tmp_path):
         said = list(lines)
     assert said[-1] == NOT_FOUND
     assert not [line for line in said[:-1] if " of 3 " not in line]
-    assert all(path.name in (".lock", ".kgs.lock") for path in (tmp_path / "out").iterdir())
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow

@@ -13,9 +13,8 @@ from kornia.geometry.conversions import rotation_matrix_to_quaternion
 from kgs._support.errors import DataError
 from kgs._support.json_files import write_json
 from kgs.app import sfm
-from kgs.app.cli.unposed import open_scene
 from kgs.app.files.outputs import write_png
-from kgs.app.files.publishing import enter
+from kgs.app.sfm.source import Source
 from kgs.datasets import synthetic_scene
 from kgs.datasets.folders import scene_nearby
 from kgs.fit.config import COARSE, DETAILS
@@ -48,13 +47,13 @@ def asked(truth, monkeypatch):
     """True cameras instead of found ones; the folders that were asked for."""
     calls = []
 
-    def true_cameras(folder, out, **_):
-        calls.append(sorted(path.name for path in folder.glob("*.png")))
+    def write_cameras(photos, out):
+        calls.append(sorted(path.name for path in photos))
         model = out / "sparse" / "0"
         model.mkdir(parents=True, exist_ok=True)
         (out / "images").mkdir(exist_ok=True)
         for name in calls[-1]:
-            shutil.copyfile(folder / name, out / "images" / name)
+            shutil.copyfile(photos[0].parent / name, out / "images" / name)
         (height, width), matrix = SIZE, truth.cameras.intrinsics[0]
         lens = matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5
         (model / "cameras.txt").write_text(f"1 PINHOLE {width} {height} {' '.join(str(float(x)) for x in lens)}\n")
@@ -71,10 +70,16 @@ def asked(truth, monkeypatch):
             "photo_size": [2 * width, 2 * height],
         }
         write_json(out / "photos.json", report | {"versions": {"kgs": "0"}})
-        enter(out, "photos")
-        return report | {"folder": str(out)}
+        return report
 
-    monkeypatch.setattr(sfm, "pose_photos", true_cameras)
+    def true_cameras(source, results, for_fit=False, **_):
+        if for_fit:
+            results.begin()
+            return write_cameras(source.photos, results.work) | {"folder": str(results.work)}
+        with results.stage() as new:
+            return write_cameras(source.photos, new) | {"folder": str(results.out)}
+
+    monkeypatch.setattr("kgs.app.sfm.pose.pose", true_cameras)
     return calls
 
 
@@ -93,7 +98,7 @@ def test_a_folder_of_photos_becomes_a_fit(folder, tmp_path, capsys, monkeypatch)
     assert "no photo was held out" in said
     assert json.loads((out / "metrics.json").read_text())["test"] is None
     assert not (out / "test").exists()
-    assert f"--cameras {out}" in said
+    assert f"kgs render {out} -o" in said
     request = json.loads((out / "config.json").read_text())["request"]
     assert (request["scene"], request["hold_out"], request["downscale"]) == (".", 0, 1.0)
     assert run("fit", tmp_path / "photos4", "-o", out, *FIT) == 0  # again, in the folder that it made
@@ -115,7 +120,7 @@ def test_cameras_alone_make_a_scene_that_is_fitted_as_its_photos_are(folder, tmp
     capsys.readouterr()
     for source, out, said in (
         (scene, tmp_path / "more", "photos without camera poses, got a scene"),
-        (photos, tmp_path / "of photos4", "expected a folder without a fit"),
+        (photos, tmp_path / "of photos4", "expected a folder for photos, got one of kgs with fit"),
     ):
         assert run("poses", source, "-o", out) == 3
         assert said in one_line(capsys)
@@ -221,14 +226,14 @@ def test_panoramas_that_get_too_low_are_refused_before_cameras_are_found(tmp_pat
 
 def test_photos_are_told_from_scenes(folder, tmp_path, asked):
     unposed = folder(4)
-    assert open_scene(unposed) is None
+    assert Source.open(unposed).scene is None
     with pytest.raises(DataError, match="nothing"):
-        open_scene(tmp_path / "nothing")
+        Source.open(tmp_path / "nothing")
     sfm.pose_photos(unposed, unposed / "out")
-    assert open_scene(unposed) is None  # what kgs made of them does not count
-    assert open_scene(unposed / "out").layout == "COLMAP"
+    assert Source.open(unposed).scene is None  # what kgs made of them does not count
+    assert Source.open(unposed / "out").scene.layout == "COLMAP"
     (unposed / "scene" / "sparse" / "0").mkdir(parents=True)
     shutil.copytree(unposed / "out" / "sparse", unposed / "scene" / "sparse", dirs_exist_ok=True)
     assert scene_nearby(unposed) == unposed / "scene"
     with pytest.raises(DataError, match="give that folder"):
-        open_scene(unposed)
+        Source.open(unposed)

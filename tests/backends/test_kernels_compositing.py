@@ -1,14 +1,11 @@
 """Compositing of kernels: what torch gives in float64."""
 
 import dataclasses
-import math
 import weakref
 
 import pytest
 import torch
 from compositing_checks import (
-    TH,
-    THRESHOLDS,
     assert_close,
     exact,
     footprints,
@@ -17,10 +14,9 @@ from compositing_checks import (
     random,
     sample,
 )
-from factories import batch, random_camera, random_gaussians
 from targets import SELDOM_INTERPRETED, TORCH, Target
 
-from kgs import RasterOptions, composite, project
+from kgs import RasterOptions, composite
 from kgs.backends.gpu import compositing
 
 
@@ -28,32 +24,6 @@ from kgs.backends.gpu import compositing
 def scene(kernels):
     """Footprints, and where float32 cannot change a decision; the picture ends within tiles."""
     return sample(12, (5, 9)) if kernels.interpreted else sample(300)
-
-
-@pytest.mark.parametrize("thresholds", THRESHOLDS)
-def test_an_ordinary_scene_is_torch_in_float64(kernels, thresholds):
-    options = dict(zip(("alpha_threshold", "transmittance_stop"), thresholds, strict=True))
-    size = (12, 13) if kernels.interpreted else (40, 56)
-    projected, certain = sample(kernels.few(300, 14), size, thresholds)
-    features = random(len(projected), 5)
-    got = outcome(projected, features, certain, kernels, **options)
-    assert_close(got, exact(projected, features, certain, **options), certain)
-
-
-@SELDOM_INTERPRETED
-@pytest.mark.parametrize("width", [0, 1, 4, 5, 8, 9, 11, 20])
-def test_any_number_of_features(kernels, scene, width):
-    projected, certain = scene
-    features = random(len(projected), width)
-    assert_close(outcome(projected, features, certain, kernels), exact(projected, features, certain), certain)
-
-
-@SELDOM_INTERPRETED
-@pytest.mark.parametrize("size", [(8, 8), (11, 5), (1, 1), (3, 100)])
-def test_image_sizes(kernels, size):
-    projected, certain = sample(kernels.few(60, 12), size)
-    got = outcome(projected, projected.colors, certain, kernels)
-    assert_close(got, exact(projected, projected.colors, certain), certain)
 
 
 def test_what_is_asked_for_beside_the_image_does_not_change_its_bits(kernels, scene):
@@ -82,16 +52,6 @@ def test_row_slices_change_nothing(kernels, width):
         outcome(projected, features, certain, kernels, max_bytes=500 if few else 3000)
 
 
-@SELDOM_INTERPRETED
-def test_several_cameras_in_row_slices(kernels):
-    gaussians = random_gaussians(10, 1, torch.float32, None, 16, (0.05, 1.0))
-    cameras = batch(*(random_camera(16, 11, seed, torch.float32) for seed in range(2)))
-    projected, options = project(gaussians, cameras), {"alpha_threshold": 0.0, "transmittance_stop": 0.0}
-    features = random(len(projected), 5)
-    got = outcome(projected, features, None, kernels, **options, max_bytes=2**13)
-    assert_close(got, exact(projected, features, **options))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("kernels", [Target("triton")], indirect=True)
 def test_row_slices_are_kept_within_max_bytes_and_freed_when_they_are_used(kernels, monkeypatch):
@@ -111,17 +71,6 @@ def test_row_slices_are_kept_within_max_bytes_and_freed_when_they_are_used(kerne
         made.clear()
         outcome(projected, random(len(projected), 3), certain, kernels, max_bytes=max_bytes)
         assert len(made) / 3 == times
-
-
-def test_no_gaussians_and_no_entries(kernels):
-    none, _ = sample(0, (9, 11))
-    unseen = footprints([0.0, 0.5], [[5.0, 4.0], [500.0, 4.0]], random(2, 2, 3), size=(9, 11))
-    for projected in (none, unseen):
-        (sums, transmittance, median), gradients = outcome(projected, random(len(projected), 3), None, kernels)
-        assert not sums.any()
-        assert not median.any()
-        assert (transmittance == 1).all()
-        assert not any(x.any() for x in gradients)
 
 
 def test_only_what_is_wanted_is_differentiated(kernels, scene):
@@ -182,30 +131,6 @@ def test_sums_of_absolute_values_are_those_of_torch(kernels, scene, options):
 
 
 @SELDOM_INTERPRETED
-@pytest.mark.parametrize("opacity", [1e-30, 0.5, 0.99, 1.0, 2.0, 1e6, 1e38, torch.inf])
-@pytest.mark.parametrize("threshold", [0.0, TH])
-def test_opacities_from_nothing_to_everything(kernels, opacity, threshold):
-    layers = footprints([opacity, 0.5], [[5.2, 4.1], [7.0, 3.0]], 2 * random(2, 2, 3), size=(8, 11), eps2d=0.3)
-    features = random(2, 3)
-    got = outcome(layers, features, None, kernels, alpha_threshold=threshold)
-    expected = exact(layers, features, alpha_threshold=threshold)
-    assert_close(got, expected, None, 2e-5, 2e-6 + 1e-6 * max(0, math.log2(min(opacity, 1e38))))
-
-
-@SELDOM_INTERPRETED
-@pytest.mark.parametrize("length", [30.0, 1e4])
-@pytest.mark.parametrize("turn", [0.0, 0.6, math.pi / 2])
-def test_needles_and_footprints_wider_than_the_picture(kernels, length, turn):
-    c, s = math.cos(turn), math.sin(turn)
-    needle = [[c * length, -s * 0.2, 0.0], [s * length, c * 0.2, 0.0]]
-    factors = torch.tensor([needle, [[length, 0.0, 0.0], [0.0, length, 0.0]], needle])
-    layers = footprints([0.6, 0.3, 0.9], [[5.3, 4.2], [3.0, 3.0], [9.0, 7.0]], factors, size=(9, 12), eps2d=0.3)
-    options, features = {"alpha_threshold": 0.0, "transmittance_stop": 0.0}, random(3, 3)
-    got = outcome(layers, features, None, kernels, **options)
-    assert_close(got, exact(layers, features, **options), None, 5e-5, 1e-5)
-
-
-@SELDOM_INTERPRETED
 @pytest.mark.parametrize("field", ["means2d", "factors", "opacities"])
 @pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf, 1e9, 1e12])
 def test_what_is_not_finite_or_overflows_is_as_in_torch(kernels, field, value):
@@ -220,10 +145,3 @@ def test_what_is_not_finite_or_overflows_is_as_in_torch(kernels, field, value):
     for a, b in zip(got[1], expected[1], strict=True):
         if b.isfinite().all():
             assert torch.allclose(a.double(), b.double(), atol=1e-5)
-
-
-@SELDOM_INTERPRETED
-def test_long_lists_end_where_the_light_does(kernels):
-    layers = footprints([0.8] * 60, size=(5, 3))  # the light ends after six of them
-    features = random(60, 3)
-    assert_close(outcome(layers, features, None, kernels), exact(layers, features))

@@ -168,9 +168,3 @@ def test_a_model_without_gaussians_decays(kernels):
     _, densifier = next(both_densifiers(kernels, 0))
     densifier.decay_opacity(0.5)
     assert len(densifier.model) == 0
-
-
-def test_a_model_in_float64_is_refused(kernels):
-    model = random_model(5, 0, torch.float64).to(kernels.device)
-    with pytest.raises(ValueError, match="for this call of optimizer, got 'triton'"):
-        Densifier(model, torch.optim.SGD(model.parameters()), 1.0, backend="triton")

@@ -50,7 +50,7 @@ def test_the_marked_default_is_the_renderers():
     options = GaussianRenderer().options
     for name in ("alpha_threshold", "transmittance_stop"):
         assert getattr(DEFAULT, name) == getattr(options, name)
-    assert {backend.tile_size for backend in BACKENDS} == {DEFAULT.tile_size}
+    assert {backend.tile_size for backend in BACKENDS.values()} == {DEFAULT.tile_size}
 
 
 @pytest.mark.parametrize("error", ["max_error", "rmse", "gradient"])

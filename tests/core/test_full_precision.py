@@ -32,7 +32,7 @@ def camera_of(kind):
 
 @pytest.fixture
 def torch_alone(monkeypatch):
-    monkeypatch.setattr(backends, "BACKENDS", (backends.TorchBackend(),))
+    monkeypatch.setattr(backends, "BACKENDS", {"torch": backends.BACKENDS["torch"]})
 
 
 @pytest.mark.usefixtures("torch_alone")

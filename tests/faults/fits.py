@@ -77,8 +77,8 @@ class Fit:
 
 def _fit(fit: Fit, limit: int | None) -> None:
     import torch
+    from fits_in_folders import fit_in
 
-    from kgs.app.fit_folder import fit_folder
     from kgs.app.scene_request import SceneRequest
     from kgs.datasets import synthetic_scene
     from kgs.fit.trainer import Trainer
@@ -98,7 +98,7 @@ def _fit(fit: Fit, limit: int | None) -> None:
     Trainer._measure_curve = measure_curve  # type: ignore[method-assign]
     try:
         config = _config(fit.steps, fit.points)
-        published = fit_folder(scene, config, fit.out, SceneRequest("."), resume=True, say=lambda _: None)
+        published = fit_in(scene, config, fit.out, SceneRequest("."), resume=True, say=lambda _: None)
     except OSError:
         os._exit(1)  # as the command does, with one line
     if published.signal:

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import pytest
 import torch
+from fits_in_folders import fit_in
 from kornia.geometry.liegroup import Se3
 from tiny_scenes import write_llff
 
 from kgs._support.errors import DataError
 from kgs.app.cli.evaluate import evaluate
-from kgs.app.files.results_folder import CHECKPOINT
-from kgs.app.fit_folder import fit_folder
+from kgs.app.files.fit_files import CHECKPOINT
 from kgs.app.saved_fit import load_fit
 from kgs.app.scene_request import SceneRequest
 from kgs.datasets import load_scene, synthetic_scene
@@ -141,7 +141,7 @@ def refined(tmp_path_factory):
     out = tmp_path_factory.mktemp("out")
     write_llff(root)
     request = SceneRequest(str(root))
-    fit_folder(request.load(out), CONFIG, out, request, say=lambda line: None)
+    fit_in(request.load(out), CONFIG, out, request, say=lambda line: None)
     return root, out
 
 

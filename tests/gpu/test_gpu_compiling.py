@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from kgs.backends import agreement
-from kgs.backends.gpu import GpuBackend, compiling
+from kgs.backends import self_check
+from kgs.backends.gpu import TRITON, compiling
 from kgs.backends.gpu import launch as launching
 from kgs.backends.gpu.compiling import compile_together, needed_launches
 from kgs.backends.gpu.launch import Launch
@@ -42,7 +42,7 @@ def cases(size, count, absgrad=False, degree=3):
 
 def test_a_training_step_needs_no_kernel_that_the_check_does_not():
     """Whatever the number of Gaussians and the size of the image, divisible by 16 or not."""
-    checked = forms(lambda: agreement.run_stages(GpuBackend(), CPU, agreement.FITS))
+    checked = forms(lambda: self_check.run_stages(TRITON, CPU, self_check.FITS))
     names = {name for name, _ in checked.values()}
     assert len(names) >= 26
     assert len(checked) <= len(names) + 8
@@ -58,17 +58,17 @@ def test_a_training_step_needs_no_kernel_that_the_check_does_not():
 
 
 def test_several_cameras_need_one_form_of_each_kernel_and_its_constants():
-    found = forms(lambda: agreement.run_stages(GpuBackend(), CPU, (agreement.EVERYTHING,)))
+    found = forms(lambda: self_check.run_stages(TRITON, CPU, (self_check.EVERYTHING,)))
     names = [(name, *constants.items()) for name, constants in found.values()]
     assert len(names) == len(set(names))
 
 
 def test_what_is_needed_is_found_without_launching(monkeypatch):
     monkeypatch.setattr("triton.runtime.interpreter.InterpretedFunction.__getitem__", lambda *_: 1 / 0)
-    found = needed_launches(lambda: agreement.run_stages(GpuBackend(), CPU, (agreement.EVERYTHING,)))
+    found = needed_launches(lambda: self_check.run_stages(TRITON, CPU, (self_check.EVERYTHING,)))
     assert "composite_backward" in {launch.kernel.fn.__name__ for launch in found}
     with pytest.raises(ZeroDivisionError):
-        agreement.run_stages(GpuBackend(), CPU, (agreement.EVERYTHING,))
+        self_check.run_stages(TRITON, CPU, (self_check.EVERYTHING,))
 
 
 # -- with kernels that only record --------------------------------------------------------------------------------
@@ -139,9 +139,9 @@ def test_the_log_says_how_far_it_is(monkeypatch, caplog):
 
 
 def test_what_goes_wrong_meanwhile_is_no_error(monkeypatch, caplog):
-    monkeypatch.setattr("kgs.backends.gpu._is_interpreted", lambda: False)
+    monkeypatch.delenv("TRITON_INTERPRET")
     devices = []
     with caplog.at_level(logging.DEBUG, "kgs"):
-        GpuBackend().compile_ahead(lambda device: devices.append(device) or 1 / 0, torch.device("cuda", 0))
+        TRITON.compile_ahead(lambda device: devices.append(device) or 1 / 0, torch.device("cuda", 0))
     assert devices == [CPU]
     assert "ZeroDivisionError" in caplog.text

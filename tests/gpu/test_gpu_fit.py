@@ -10,9 +10,8 @@ from operators import Operators
 from torch.utils._python_dispatch import _disable_current_modes
 
 import kgs
-from kgs import backends
-from kgs.backends import gpu
-from kgs.backends.gpu import compositing, projection
+from kgs.backends import get_backend
+from kgs.backends.gpu import compositing, projection, trust
 from kgs.datasets import synthetic_scene
 from kgs.fit import FitConfig, Trainer
 from kgs.fit.plan import make_plan
@@ -120,16 +119,16 @@ def test_a_fit_that_looks_seldom_finds_what_is_not_finite_and_never_saves_it(sce
 
 
 def test_auto_never_takes_the_interpreter():
-    assert backends.resolve("auto", CPU) in ("numba", "torch")
-    assert backends.resolve("triton", CPU) == "triton"
-    assert not gpu.GpuBackend().is_trusted(CPU)
+    assert get_backend("auto", CPU).name in ("numba", "torch")
+    assert get_backend("triton", CPU).name == "triton"
+    assert not trust.is_trusted(CPU)
 
 
 @pytest.fixture
 def unchecked():
-    gpu.self_check.cache_clear()
+    trust.passes_check.cache_clear()
     yield
-    gpu.self_check.cache_clear()
+    trust.passes_check.cache_clear()
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -142,10 +141,10 @@ def test_kernels_that_fail_are_not_used_and_a_line_says_so(monkeypatch):
 
     monkeypatch.setattr(projection, "launch", launch)
     with pytest.warns(UserWarning, match="Triton's kernels are not used on cpu, torch is: ZeroDivisionError"):
-        assert not gpu.self_check(CPU)
+        assert not trust.passes_check(CPU)
     with warnings.catch_warnings():  # once
         warnings.simplefilter("error")
-        assert not gpu.self_check(CPU)
+        assert not trust.passes_check(CPU)
 
 
 @pytest.mark.slow
@@ -153,11 +152,11 @@ def test_kernels_that_fail_are_not_used_and_a_line_says_so(monkeypatch):
 def test_kernels_that_differ_are_not_used_and_a_line_says_so(monkeypatch):
     monkeypatch.setattr(compositing, "FEATURES", 2)  # blocks of four overlap: what they say is added up twice
     with pytest.warns(UserWarning, match=r"they differ from torch by .*, more than 5e-05"):
-        assert not gpu.self_check(CPU)
+        assert not trust.passes_check(CPU)
 
 
 def test_without_triton_a_clear_error(monkeypatch):
-    monkeypatch.setattr("kgs.backends.base._is_found", lambda package: False)
+    monkeypatch.setattr("kgs.backends.table._is_found", lambda package: False)
     with pytest.raises(ModuleNotFoundError, match='"triton" needs triton, torch brings it on Linux'):
         kgs.GaussianRenderer(backend="triton")
 
@@ -165,4 +164,4 @@ def test_without_triton_a_clear_error(monkeypatch):
 def test_on_a_cpu_without_the_interpreter_it_is_refused(monkeypatch):
     monkeypatch.delenv("TRITON_INTERPRET")
     with pytest.raises(ValueError, match='expected "auto" or "torch" on cpu, got "triton", which runs on cuda and xpu'):
-        backends.resolve("triton", CPU)
+        get_backend("triton", CPU)

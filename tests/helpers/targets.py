@@ -47,12 +47,28 @@ ALL_KERNELS = [_NUMBA, pytest.param(Target("triton"), id="triton interpreted"), 
 _SELDOM = [_NUMBA, pytest.param(Target("triton"), id="triton interpreted", marks=pytest.mark.slow), _CARD]
 SELDOM_INTERPRETED = pytest.mark.parametrize("kernels", _SELDOM, indirect=True)
 TRITON = pytest.mark.parametrize("kernels", ALL_KERNELS[1:], indirect=True)
+
+
+def on_kernels(cases: dict[str, Any], seldom_interpreted: dict[str, Any]) -> pytest.MarkDecorator:
+    """Run a test with the fixtures `kernels` and `case` for each case on each of them.
+
+    Those of the second table run in Triton's interpreter with the slow tests alone.
+    """
+    params = [
+        pytest.param(target.values[0], case, id=f"{target.id}, {name}", marks=target.marks)
+        for targets, table in ((ALL_KERNELS, cases), (_SELDOM, seldom_interpreted))
+        for target in targets
+        for name, case in table.items()
+    ]
+    return pytest.mark.parametrize(("kernels", "case"), params, indirect=["kernels"])
+
+
 COMPILED = pytest.mark.parametrize("kernels", [_NUMBA, _CARD], indirect=True)
 
 
 def skip_unless_there(target: Target) -> None:
     """Skip the test where the backend is not installed, or is for a card alone."""
-    if not next(backend for backend in BACKENDS if backend.name == target.backend).is_installed():
+    if not BACKENDS[target.backend].is_installed():
         pytest.skip(f"{target.backend} is not installed")
     if target.interpreted and os.environ.get("TRITON_INTERPRET") != "1":
         pytest.skip("Triton's interpreter is off")

@@ -7,11 +7,11 @@ import pytest
 import torch
 import trimesh
 from factories import with_camera
+from fits_in_folders import fit_in
 from init_point_scenes import flat
 
 import kgs
 from kgs._support.errors import DataError
-from kgs.app.fit_folder import fit_folder
 from kgs.app.scene_request import SceneRequest
 from kgs.fit import FitConfig
 from kgs.fit.run import choose_points
@@ -60,8 +60,8 @@ def test_points_in_another_frame_end_a_fit_before_it_begins(scene, tmp_path, shi
     out = tmp_path / "out"
     message = f"cloud.ply: initial points: .* got none of 40, of which {in_front} lie before a camera"
     with pytest.raises(DataError, match=message):
-        fit_folder(scene, config, out, SceneRequest("somewhere"))
-    assert not any(path.suffix for path in out.iterdir())
+        fit_in(scene, config, out, SceneRequest("somewhere"))
+    assert not out.exists()
 
 
 def test_views_that_show_no_initial_point_are_named(scene, tmp_path, recwarn):

@@ -6,6 +6,7 @@ import pytest
 import torch
 from kernel_checks import avx_assembly, check_bits
 
+from kgs.backends import BACKENDS
 from kgs.init_points import matching
 
 nb = pytest.importorskip("numba")
@@ -31,7 +32,7 @@ def keypoints(n, m, seed=0):
 
 
 def matches(arguments, backend):
-    return matching.match(*arguments, backend)
+    return matching.match(*arguments, BACKENDS[backend])
 
 
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (5, 200), (300, 37), (400, 500), (0, 20), (20, 0), (0, 0)])

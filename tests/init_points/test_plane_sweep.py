@@ -8,6 +8,7 @@ from factories import other_defaults
 from kernel_checks import avx_assembly, check_bits
 from torch.nn.functional import grid_sample, pad
 
+from kgs.backends import BACKENDS
 from kgs.datasets.synthetic import synthetic_scene
 from kgs.init_points import plane_sweep
 from kgs.init_points import sweep_costs as sweep_costs_module
@@ -71,7 +72,7 @@ def test_scores_are_correlations(count, height, width, planes, backend):
         best = 0.75 * best + 0.25 * second.where(seen.sum(0) > 1, sweep_costs_module.ALONE * best)
     assert bool(seen.any())
     assert bool((~seen).any())
-    _, unsmoothed = sweep_costs(image, others, turns, backend)
+    _, unsmoothed = sweep_costs(image, others, turns, BACKENDS[backend])
     expected = 1 - best.where(seen.any(0), sweep_costs_module.UNSEEN)
     torch.testing.assert_close(unsmoothed, expected.float(), rtol=1e-6, atol=2e-6, check_stride=False)
 
@@ -79,7 +80,7 @@ def test_scores_are_correlations(count, height, width, planes, backend):
 @pytest.mark.parametrize(("height", "width", "planes"), [(7, 9, 3), (33, 20, 16), (16, 67, 21), (41, 40, 40)])
 def test_smoothed_costs_are_torchs(height, width, planes):
     image, others, turns = pictures(2, height, width, planes)
-    smoothed, unsmoothed = sweep_costs(image, others, turns, "numba")
+    smoothed, unsmoothed = sweep_costs(image, others, turns, BACKENDS["numba"])
     expected = sweep_costs_module._semi_global(unsmoothed.contiguous(), image)
     torch.testing.assert_close(smoothed, expected, rtol=1e-6, atol=2e-6, check_stride=False)
 
@@ -140,7 +141,6 @@ def test_a_sweep_stays_on_its_device_and_its_maps_are_on_the_cpu(monkeypatch, ba
         fetched.append(tensor.device.type)
         return torch.zeros_like(tensor, device="cpu")
 
-    monkeypatch.setattr("kgs.backends.check_backend", lambda _: None)  # triton need not be installed
     views = synthetic_scene(train_views=3, test_views=1, size=(24, 32), seed=0).train
     to_cpu = torch.Tensor.cpu
     monkeypatch.setattr(torch.Tensor, "cpu", lambda x: cpu(x) if x.is_meta else to_cpu(x))
@@ -164,7 +164,7 @@ def test_a_sweep_is_the_same_under_another_default_device_and_dtype():
 
 def test_bits_depend_neither_on_threads_nor_on_repetition():
     arguments = pictures(2, 70, 61, 24)
-    check_bits(lambda: sweep_costs(*arguments, "numba"), (1, 1, 2, 2, 3, 3, 4, 4))
+    check_bits(lambda: sweep_costs(*arguments, BACKENDS["numba"]), (1, 1, 2, 2, 3, 3, 4, 4))
 
 
 @pytest.mark.slow

@@ -14,7 +14,6 @@ from unittest import mock
 import pytest
 from grid_cells import cells_in, do, processes_left, threads_of_torch, times_done
 
-from kgs import DataError
 from kgs.study import grid
 from kgs.study.grid import read_rows, run_grid
 
@@ -78,19 +77,6 @@ def test_a_last_line_is_done_again_only_if_it_is_not_whole(tmp_path, threads, ne
     assert len(path.read_bytes().splitlines()) == 6
     assert path.read_bytes().startswith(content[: content.rindex(b'{"cell')])
     assert len(read_rows(path)) == 6
-
-
-def test_a_file_belongs_to_one_run_at_a_time(tmp_path, threads):
-    path, refused = tmp_path / "rows.jsonl", []
-
-    def second(line):
-        with pytest.raises(DataError, match=r"rows\.jsonl: expected no other run") as error:
-            run_grid(CELLS, square, path, scheduler=threads, say=quiet)
-        refused.append(error)
-
-    assert len(run_grid(CELLS, square, path, scheduler=threads, say=second)) == len(CELLS)
-    assert len(refused) > len(CELLS)  # each time that the first run said something
-    assert len(read_rows(path)) == len(CELLS)
 
 
 def test_a_failing_cell_stops_no_other(tmp_path, threads):

@@ -8,6 +8,7 @@ from study_rows import tiny_cell
 from tiny_scenes import write_llff
 
 from kgs import DataError
+from kgs.app.files.results import Results
 from kgs.datasets import load_scene
 from kgs.study import grid, presets
 from kgs.study.beyond import beyond_cells
@@ -131,7 +132,7 @@ def test_the_report_of_another_preset_is_not_overwritten(unchanged, monkeypatch,
 
 
 def test_a_second_run_is_refused_and_writes_nothing(unchanged, threads):
-    with grid._alone(unchanged / "sparse.jsonl"), pytest.raises(DataError, match="expected no other run"):
+    with Results.open(unchanged, "study"), pytest.raises(DataError, match="at work"):
         study(out=unchanged, scheduler=threads)
 
 

@@ -1,6 +1,6 @@
 """`kgs bench`: what rendering costs on this machine, and how exact it is."""
 
-from pathlib import Path
+from kgs.app.files.results import Results
 
 from .options import Out
 from .tools import check_installed, load_tools
@@ -21,13 +21,13 @@ def speed(*, out: Out, quick: bool = False, device: str = "auto") -> None:
         device: auto: a GPU if kgs has kernels for it, else the CPU. Or cpu, cuda, cuda:1, ...
     """
     check_installed("matplotlib")
-    found = _begin(out, "speed", "scaling.png", device=device)
+    with Results.open(out, "bench") as results:
+        found = load_tools(device)
 
-    from kgs.app.files.publishing import replacing
-    from kgs.bench.speed import speed
+        from kgs.bench.speed import speed
 
-    with replacing(out, "bench speed") as new:
-        speed(out=new, quick=quick, device=found)
+        with results.stage(keep=True) as new:
+            speed(out=new, quick=quick, device=str(found))
 
 
 def precision(*, out: Out, quick: bool = False) -> None:
@@ -44,13 +44,13 @@ def precision(*, out: Out, quick: bool = False) -> None:
         quick: small images with few Gaussians.
     """
     check_installed("matplotlib")
-    _begin(out, "precision", "render.png", "gradients.png")
+    with Results.open(out, "bench") as results:
+        load_tools()
 
-    from kgs.app.files.publishing import replacing
-    from kgs.bench.precision import precision
+        from kgs.bench.precision import precision
 
-    with replacing(out, "bench precision") as new:
-        precision(out=new, quick=quick)
+        with results.stage(keep=True) as new:
+            precision(out=new, quick=quick)
 
 
 def extremes(*, out: Out) -> int:
@@ -65,20 +65,10 @@ def extremes(*, out: Out) -> int:
     Args:
         out: folder for the results, created if it does not exist.
     """
-    _begin(out, "extremes")
+    with Results.open(out, "bench") as results:
+        load_tools()
 
-    from kgs.app.files.publishing import replacing
-    from kgs.bench.extremes import extremes
+        from kgs.bench.extremes import extremes
 
-    with replacing(out, "bench extremes") as new:
-        return extremes(out=new)
-
-
-def _begin(out: Path, name: str, *pictures: str, device: str = "cpu") -> str:
-    """Check the folder of a benchmark, which writes files of its name and pictures; load torch, and name the device."""
-    from kgs.app.files.outputs import check_folder
-    from kgs.app.files.publishing import check_free
-
-    check_folder(out, make=False)
-    check_free(out, f"bench {name}", (f"{name}.csv", f"{name}.json", f"{name}.md", *pictures))
-    return str(load_tools(device))
+        with results.stage(keep=True) as new:
+            return extremes(out=new)

@@ -1,13 +1,20 @@
 """Checks of options that need no torch: a command calls them first, because torch takes seconds to load."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from kgs._support.errors import ArgumentError, DataError, quoted
 from kgs.datasets.folders import has_photos
 from kgs.datasets.options import held_out_between_ends
 from kgs.datasets.source import SceneSource
 
+from .tools import check_installed
+
+if TYPE_CHECKING:
+    from kgs.app.sfm.source import Source
+
 SMALLEST = 32  # pixels of the longer side of a fit's photos
+_HEAD = 4096  # bytes, enough for the header of any splat
 
 
 def check_roll(roll: float) -> None:
@@ -22,12 +29,12 @@ def check_side(size: int) -> None:
         raise ArgumentError("size", f"at least {SMALLEST} pixels", size)
 
 
-def check_file(out: Path, ending: str, kind: str, source: Path | None = None) -> None:
+def check_file(out: Path, ending: str, source: Path | None = None) -> None:
     """Raise a ValueError or DataError unless a command can write its result to this file, which is not `source`.
 
-    `kind` is that of :func:`kgs.app.files.publishing.replacing`.
+    A file that is there is replaced if kgs wrote it, and if it is none of the results of a fit.
     """
-    from kgs.app.files.publishing import check_free
+    from kgs.app.files.results import read_marker
 
     if out.suffix.lower() != ending:
         raise ArgumentError("out", f"a file that ends in {ending}", quoted(out))
@@ -37,7 +44,19 @@ def check_file(out: Path, ending: str, kind: str, source: Path | None = None) ->
         raise ArgumentError("out", f"another file than {str(source)!r}, which is read")
     if not out.absolute().parent.is_dir():
         raise DataError(out, "", "a folder to write it to", "none")
-    check_free(out.parent, kind, [out.name])
+    if out.exists() and not _is_of_kgs(out):
+        raise DataError(out, "", "a new file or one that kgs wrote", "another", advice="choose another name")
+    results = read_marker(out.parent)
+    if any(out.name in results.get(kind, []) for kind in ("fit", "scale")):
+        raise DataError(out, "", "a new file", "one of the results in this folder", advice="choose another name")
+
+
+def _is_of_kgs(path: Path) -> bool:
+    """Whether a file begins as the splats and pages that kgs writes."""
+    with path.open("rb") as file:
+        head = file.read(_HEAD)
+    is_splat = head.startswith(b"ply\n") and any(word in head for word in (b"\ncomment kgs ", b" packed_position\n"))
+    return is_splat or b'<meta name="generator" content="made by kgs ' in head
 
 
 def check_photos_of(source: SceneSource) -> None:
@@ -47,37 +66,48 @@ def check_photos_of(source: SceneSource) -> None:
 
 
 def check_results(out: Path) -> None:
-    """Raise a DataError unless this is the folder of the results of a fit."""
-    from kgs._support.json_files import read_json
-    from kgs.app.files.locks import locked
-    from kgs.app.files.publishing import UNFINISHED, complete
-    from kgs.app.files.results_folder import has_fit
+    """Raise a DataError unless this is the folder of the results of a fit; end what a kill left of a move there."""
+    from kgs.app.files.fit_files import UNFINISHED, has_fit
+    from kgs.app.files.results import complete
 
     complete(out)
     config = out / "config.json"
     if not config.exists() and has_fit(out / UNFINISHED):
-        with locked(out):  # or it is at work
-            raise DataError(out, "", "a fit that is done", "one that is not", advice="kgs fit --resume goes on with it")
+        raise DataError(out, "", "a fit that is done", "one that is not", advice="kgs fit --resume goes on with it")
     if not config.exists():
         raise DataError(config, "", "this file in the folder of the results of kgs fit", "none")
-    read_json(config)
+
+
+def check_init(init: str, source: "Source") -> None:
+    """Raise an ArgumentError unless a fit can begin with these initial points."""
+    if init == "scene" and (source.scene is None or source.scene.layout != "Blender"):
+        kind = "photos without camera poses" if source.scene is None else f"the layout {source.scene.layout}"
+        raise ArgumentError("init", f"another one for {kind}", "'scene', Blender's points")
+
+
+def check_frames(frames: int | None, source: "Source") -> None:
+    """Raise an ArgumentError unless so many frames can be taken from a video."""
+    from kgs.app.sfm.find import MIN_PHOTOS
+
+    if frames is not None and frames < MIN_PHOTOS:
+        raise ArgumentError("frames", f"at least {MIN_PHOTOS}", frames)
+    if frames is not None and source.video is None:
+        raise ArgumentError("frames", "a video to take them from", "photos")
 
 
 def check_photos(
-    folder: Path,
-    out: Path,
+    source: "Source",
     views: int | None = None,
     hold_out: int | None = None,
-    size: int | None = None,
+    size: int | str | None = None,
     downscale: float | None = None,
     frames: int | None = None,
     shortest: int = 1,
 ) -> None:
-    """Check a folder of unposed photos or a video, and the options about them, before their cameras are found.
+    """Check that a scene has photos; of unposed photos check the options before their cameras are found.
 
     Args:
-        folder: of the photos, or a video. Of a video only the largest number of frames is known.
-        out: the folder for the results.
+        source: a scene, photos, or a video, of which only the largest number of frames is known.
         views: to train on.
         hold_out: every Nth photo is held out.
         size: longer side of the photos in the fit; it needs the photos' headers, as `downscale` does.
@@ -85,23 +115,24 @@ def check_photos(
         frames: to be taken from a video.
         shortest: least pixels of the shorter side in the fit.
     """
-    from kgs.app.sfm.find import MAX_FRAMES, find_photos, find_video
-    from kgs.app.sfm.workspace import check_workspace
+    from kgs.app.sfm.find import MAX_FRAMES
 
-    if find_video(folder):
+    if source.scene is not None:
+        check_photos_of(source.scene)
+        return
+    check_installed("pycolmap")
+    if source.video is not None:
         _check_views(views, hold_out, MAX_FRAMES if frames is None else frames, "frames")
         return
-    paths = find_photos(folder)
-    check_workspace(out, paths)
-    _check_views(views, hold_out, len(paths), "photos")
+    _check_views(views, hold_out, len(source.photos), "photos")
     if size is None and downscale is None:
         return
 
     from kgs.datasets.image_file import ImageFile
 
-    width, height = min(ImageFile(path).size for path in paths)
+    width, height = min(ImageFile(path).size for path in source.photos)
     name = "size" if downscale is None else "downscale"
-    factor = max(1.0, max(width, height) / size) if size is not None else downscale or 1.0
+    factor = max(1.0, max(width, height) / size) if isinstance(size, int) else downscale or 1.0
     reduced = [max(1, round(side / factor)) for side in (width, height)]
     for side, minimum, pixels in (("longer", SMALLEST, max(reduced)), ("shorter", shortest, min(reduced))):
         if pixels < minimum:

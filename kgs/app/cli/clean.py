@@ -58,7 +58,7 @@ def clean(
     from kgs.datasets.source import SceneSource
 
     check_options(downscale, None)
-    check_file(out, ".ply", "clean", splat)
+    check_file(out, ".ply", splat)
     source = None if cameras is None else SceneSource(cameras)
     if source is not None:
         check_photos_of(source)
@@ -71,7 +71,6 @@ def clean(
         raise ArgumentError("downscale", "--cameras with it", "none")
     torch_device = load_tools(device, backend)
 
-    from kgs.app.files.publishing import replacing
     from kgs.app.saved_fit import load_fit
     from kgs.fit.clean import check_left, check_strength, find_artifacts
     from kgs.fit.clean import clean as clean_fit
@@ -101,8 +100,7 @@ def clean(
         check_left(len(model))
         removed = artifacts.counts(artifacts.any)
         fitted = len(whole)
-    with replacing(out.parent, "clean") as new:
-        save_ply(new / out.name, model, offset=offset)
+    save_ply(out, model, offset=offset)
     kinds = ", ".join(f"{count} {kind}" for kind, count in removed.items())
     say(f"{printable(out)}: {len(model)} of {fitted} Gaussians; removed: {kinds}")
     if fit is None:

@@ -1,14 +1,13 @@
 """`kgs demo`: fits a built-in scene as `kgs fit` fits a scene, and to compare once more without DropGaussian."""
 
 import math
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from kgs._support.errors import printable, quantity
 from kgs.app.console import VIEWER, as_line, open_in_browser, say, say_next, say_on_terminal
-from kgs.datasets.folders import LAYOUT_FILES
+from kgs.app.files.results import Results
 from kgs.fit.config import DEMO, DEMO_STEPS, ROOM_DEMO, Backend, FitConfig
 
 from .checks import check_side
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
     from kgs.fit.fit import Fit
 
 _SHEET = "demo.png"  # held-out photos beside their renders
-_CAMERAS = LAYOUT_FILES["nerfstudio"]
 _WITHOUT = "without.json"  # the measures of the fit without dropping
 
 
@@ -59,88 +57,68 @@ def demo(
         device: auto: a GPU if kgs has kernels for it, else the CPU. Or cpu, cuda, cuda:1, ...
         backend: auto: the fastest that is installed. kgs fit --help-all describes the others.
     """
-    from kgs.app.files.locks import locked
-    from kgs.app.files.outputs import check_folder
-    from kgs.app.files.publishing import UNFINISHED, check_free
-    from kgs.app.files.results_folder import begun_on_cpu, check_fit_files
-    from kgs.datasets.folders import CAMERAS_REPORT, list_images
+    from kgs.app.files.fit_files import begun_on_cpu
 
-    preset = ROOM_DEMO if scene == "room" else DEMO
     if size is not None:
         check_side(size)
-    check_folder(out, make=False)
-    with locked(out) if (out / UNFINISHED).is_dir() else nullcontext():
-        check_fit_files(out, resume, [_SHEET, _WITHOUT])
-        for folder in (out, out / UNFINISHED):
-            images = folder / "images"
-            there = [f"images/{path.name}" for path in list_images(images)] if images.is_dir() else []
-            check_free(folder, "photos", [_CAMERAS, CAMERAS_REPORT, "images/LICENSE", *there])
-    if resume and device == "auto" and begun_on_cpu(out):
-        device = "cpu"  # on a GPU it would go on with other bits
-    found = load_tools(device, backend, "jinja2", "safetensors")
-    config = replace(preset, seed=seed, steps=steps, device=str(found), backend=backend)
+    with Results.open(out, "fit", beside=["photos"], resume=resume) as results:
+        if resume and device == "auto" and begun_on_cpu(out):
+            device = "cpu"  # on a GPU it would go on with other bits
+        found = load_tools(device, backend, "jinja2", "safetensors")
+        preset = ROOM_DEMO if scene == "room" else DEMO
+        config = replace(preset, seed=seed, steps=steps, device=str(found), backend=backend)
 
-    from kgs._support.machine import device_name
-    from kgs.app.demo_scene import CREDIT
-    from kgs.app.fit_folder import fit_folder
-    from kgs.app.stages import Stages
-    from kgs.metrics.evaluate import as_text
+        from kgs._support.machine import device_name
+        from kgs.app.demo_scene import CREDIT
+        from kgs.app.fit_folder import fit_folder
+        from kgs.app.stages import Stages
+        from kgs.metrics.evaluate import as_text
 
-    say(f"device: {device_name(found)}")
-    request, loaded = _write_scene(scene, out, size, seed, resume)
-    height, width = loaded.train.images.shape[-2:]
-    say(f"{quantity(len(loaded.train), 'training photo')} of {width}x{height}, {len(loaded.test)} held out")
-    published = fit_folder(loaded, config, out, request, resume=resume, stages=Stages(say_on_terminal))
-    splat = published.folder / "splat.ply"
-    if published.signal:
-        say_next("the same command with --resume goes on where it stopped")
-        return 128 + published.signal
-    say(as_text(published.fit.metrics))
-    _compare(published.fit, config if compare else None, request, out)
+        say(f"device: {device_name(found)}")
+        request, loaded = _write_scene(scene, results, size, seed)
+        height, width = loaded.train.images.shape[-2:]
+        say(f"{quantity(len(loaded.train), 'training photo')} of {width}x{height}, {len(loaded.test)} held out")
+        published = fit_folder(loaded, config, results, request, resume=resume, stages=Stages(say_on_terminal))
+        if published.signal:
+            say_next("the same command with --resume goes on where it stopped")
+            return 128 + published.signal
+        say(as_text(published.fit.metrics))
+        _compare(published.fit, config if compare else None, request, results)
     if scene == "bananas":
         say(CREDIT)
     say(f"pictures: {printable(out / _SHEET)}, {printable(out / 'curve.png')}")
     say_next(
         f"open {as_line(out / 'index.html')} in a browser",
         "kgs fit PHOTOS -o OUT  # three or more photos of your own",
-        VIEWER.format(as_line(splat)),
+        VIEWER.format(as_line(out / "splat.ply")),
     )
     if open_page:
         open_in_browser(out / "index.html")
     return 0
 
 
-def _write_scene(name: str, out: Path, size: int | None, seed: int, resume: bool) -> "tuple[SceneRequest, Scene]":
-    """Write the photos to the folder of an unfinished fit, as `pose_photos` does; then load them."""
+def _write_scene(name: str, results: Results, size: int | None, seed: int) -> "tuple[SceneRequest, Scene]":
+    """Write the photos to the folder of the new fit, and load them."""
     from kgs.app.demo_scene import SIDE, write_bananas, write_room
-    from kgs.app.files.locks import locked
-    from kgs.app.files.publishing import UNFINISHED, complete, replacing
-    from kgs.app.files.results_folder import check_no_fit
     from kgs.app.scene_request import SceneRequest
     from kgs.datasets.source import SceneSource
 
-    work = out / UNFINISHED
-    out.mkdir(parents=True, exist_ok=True)
-    with locked(out):
-        complete(out)
-        if not resume:
-            check_no_fit(work)
-        with replacing(work, "photos", all_former=True) as new:
-            if name == "room":
-                write_room(new, size or SIDE, seed)
-            else:
-                write_bananas(new)
+    results.begin()
+    results.discard("photos")
+    results.work.mkdir(exist_ok=True)
+    if name == "room":
+        write_room(results.work, size or SIDE, seed)
+    else:
+        write_bananas(results.work)
     reduced = 1.0 if name == "room" or size is None else max(1.0, SIDE / size)
     request = SceneRequest(".", downscale=reduced, title="kgs demo")
-    return request, request.load(out, say, SceneSource(work))
+    return request, request.load(results.out, say, SceneSource(results.work))
 
 
-def _compare(fit: "Fit", config: FitConfig | None, request: "SceneRequest", out: Path) -> None:
+def _compare(fit: "Fit", config: FitConfig | None, request: "SceneRequest", results: Results) -> None:
     """Write held-out photos beside their renders: with dropping, and with a `config` of a fit without, too."""
     from kgs._support.json_files import read_json, write_json
     from kgs.app.files.figures import write_curve, write_sheet
-    from kgs.app.files.locks import locked
-    from kgs.app.files.publishing import replacing
     from kgs.app.page.fit_page import PAGE, write_fit_page
     from kgs.app.training import Training
     from kgs.fit.measures import measure
@@ -157,7 +135,7 @@ def _compare(fit: "Fit", config: FitConfig | None, request: "SceneRequest", out:
     renders = {title: [image[0] for image in one.test_renders.images] for title, one in fits.items()}
     levels = list(map(_level, fit.metrics["test"]["views"]))
     worst = sorted(range(len(levels)), key=levels.__getitem__)[:2]
-    with locked(out), replacing(out, "fit") as new:
+    with results.stage(keep=True) as new:
         write_sheet(new / _SHEET, scene.test, renders, sorted(worst))
         if config is not None:
             write_json(new / _WITHOUT, fits["without DropGaussian"].metrics)
@@ -167,7 +145,7 @@ def _compare(fit: "Fit", config: FitConfig | None, request: "SceneRequest", out:
                 request.title,
                 fits,
                 notes=["The viewer and the sliders show the fit with DropGaussian."],
-                settings=read_json(out / "config.json"),
+                settings=read_json(results.out / "config.json"),
             )
 
 

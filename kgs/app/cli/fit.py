@@ -2,10 +2,6 @@
 
 import inspect
 import os
-import re
-import sys
-import warnings
-from contextlib import nullcontext
 from dataclasses import MISSING, field, make_dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -13,14 +9,15 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 import tyro
 
-from kgs._support.errors import ArgumentError, DataError, printable, quantity, quoted
-from kgs.app.console import VIEWER, as_line, open_in_browser, say, say_next, say_on_terminal
+from kgs._support.errors import ArgumentError
+from kgs.app.files.results import Results
 from kgs.fit.config import COARSE, DETAILS, PRESETS, Background, FitConfig, min_side
 
-from .checks import SMALLEST, check_photos, check_photos_of, check_roll, check_side
+from .checks import check_frames, check_init, check_photos, check_roll
 from .options import QUIET, Flag, IfGiven, Open, Out
-from .tools import check_installed, load_tools
-from .unposed import check_frames, find_scene, is_posed_by_kgs, on_ctrl_c, open_scene
+from .run_fit import run_fit
+from .size import check_size, default_size
+from .tools import load_tools
 from .words import options_in
 
 # The short help shows these entries of FitConfig, and all other options of the command but the rare ones.
@@ -106,149 +103,65 @@ def fit(
         open_page: open the page in a browser when the fit is done.
         config: every number of the fit.
     """
-    from kgs.app.files.locks import locked
-    from kgs.app.files.outputs import check_folder
-    from kgs.app.files.publishing import UNFINISHED
-    from kgs.app.files.results_folder import begun_on_cpu, check_fit_files
-    from kgs.datasets.folders import CAMERAS_REPORT
+    from kgs.app.files.fit_files import begun_on_cpu
+    from kgs.app.scene_request import SceneRequest
+    from kgs.app.sfm.source import Source
     from kgs.datasets.options import check_options
     from kgs.metrics.weights import weight_files
 
-    source = open_scene(scene)
-    unposed = source is None
-    as_photos = source is None or is_posed_by_kgs(source)
-    if measure and (not as_photos or hold_out or views is not None):
+    source = Source.open(scene)
+    if source.has_kgs_cameras and hold_out is None:
+        hold_out = 0
+    if measure and (not source.has_kgs_cameras or hold_out or views is not None):
         reason = "photos without camera poses, and neither --hold-out nor --views: these hold photos out themselves"
         raise ArgumentError("measure", reason)
-    if as_photos and hold_out is None:
-        hold_out = 0
-    check_roll(roll)
-    _check_size(size, downscale, unposed)
     if views is not None and views < 1:
         raise ArgumentError("views", "a whole number of at least 1", views)
+    check_roll(roll)
+    check_size(size, downscale, source.scene is None)
     check_options(downscale, hold_out)
-    check_frames(frames, scene)
+    check_frames(frames, source)
     if lpips_weights is not None:
         weight_files(lpips_weights)
-    check_folder(out, scene, make=False)
-    with locked(out) if (out / UNFINISHED).is_dir() else nullcontext():
-        check_fit_files(out, resume)
-    if source is None:
-        check_installed("pycolmap")
-        pixels = size if isinstance(size, int) else None
+    with Results.open(out, "fit", ["photos"] if source.scene is None else [], resume) as results:
         shortest = min_side(config, lpips_weights is not None)
-        check_photos(scene, out, views, hold_out, pixels, downscale, frames, shortest)
-    else:
-        check_photos_of(source)
-    if config.init == "scene" and (source is None or source.layout != "Blender"):
-        kind = "photos without camera poses" if source is None else f"the layout {source.layout}"
-        raise ArgumentError("init", f"another one for {kind}", "'scene', Blender's points")
-    if resume and config.device == "auto" and begun_on_cpu(out):
-        config = replace(config, device="cpu")  # on a GPU it would go on with other bits
-    device = load_tools(config.device, config.backend, "safetensors", "jinja2")
-    config = replace(config, device=str(device))
-
-    from kgs._support.machine import device_name
-    from kgs.app.fit_folder import fit_folder
-    from kgs.app.held_out import MIN_PHOTOS, measure_held_out
-    from kgs.app.scene_request import SceneRequest
-    from kgs.app.stages import Stages
-    from kgs.datasets import load_scene
-    from kgs.datasets.field import field_size
-    from kgs.fit.pruning import left_out
-    from kgs.init_points.files import read_points
-    from kgs.metrics.evaluate import as_text
-    from kgs.metrics.lpips import Lpips
-
-    if config.init_file is not None:
-        with warnings.catch_warnings(action="ignore"):
-            read_points(config.init_file)  # an error now, not once there are cameras
-    lpips = None if lpips_weights is None else Lpips.load(lpips_weights).to(device)
-    request = SceneRequest(
-        scene=os.path.abspath(scene),
-        train_views=views,
-        downscale=downscale,
-        hold_out=hold_out,
-        background=background,
-        points=config.init if config.init == "model-points" else "none",
-        photos=not no_photos,
-        roll=roll,
-        title=title or "",
-        masks="" if masks is None else os.path.abspath(masks),
-        mask_mode=mask_mode,
-    )
-    is_free = size is None and downscale is None  # the size follows from --detail
-    say(f"device: {device_name(device)}")
-    stages = Stages(say_on_terminal, unposed, measure)
-    if is_free and (detail != "normal" or (as_photos and device.type == "cpu")):
-        size = DETAILS[detail].size
-        if config.coarse is None:
+        check_photos(source, views, hold_out, size, downscale, frames, shortest)
+        check_init(config.init, source)
+        if resume and config.device == "auto" and begun_on_cpu(out):
+            config = replace(config, device="cpu")  # on a GPU it would go on with other bits
+        device = load_tools(config.device, config.backend, "safetensors", "jinja2")
+        config = replace(config, device=str(device))
+        request = SceneRequest(
+            scene=os.path.abspath(scene),
+            train_views=views,
+            downscale=downscale,
+            hold_out=hold_out,
+            background=background,
+            points=config.init if config.init == "model-points" else "none",
+            photos=not no_photos,
+            roll=roll,
+            title=title or "",
+            masks="" if masks is None else os.path.abspath(masks),
+            mask_mode=mask_mode,
+        )
+        is_free = size is None and downscale is None  # the size follows from --detail
+        if is_free:
+            size = default_size(detail, preset, source.has_kgs_cameras, device.type == "cpu")
+        if is_free and isinstance(size, int) and config.coarse is None:
             config = replace(config, coarse=COARSE)
-    if preset in ("paper", "plain") and size is None and downscale is None and not as_photos:
-        size = "field"
-    if source is None:
-        stages.begin("cameras")
-        assert not isinstance(size, str)  # refused before
-        request, source = find_scene(scene, out, request, config.seed, size, frames)
-    elif (out / CAMERAS_REPORT).exists():
-        raise DataError(
-            out, "", "a folder without cameras", "those that kgs found for other photos", advice="choose another folder"
+        return run_fit(
+            source,
+            results,
+            request,
+            config,
+            size,
+            frames=frames,
+            measure=measure,
+            resume=resume,
+            lpips_weights=lpips_weights,
+            suggest_detail=is_free and preset == "auto",
+            open_page=open_page,
         )
-    elif size == "field":
-        photo_folder, factor, why = field_size(source)
-        say(why)
-        request = replace(request, photo_folder=photo_folder, downscale=factor)
-    elif isinstance(size, str):
-        request = replace(request, photo_folder=size)
-    elif size is not None:
-        height, width = load_scene(source, photos=False, hold_out=hold_out).train.images.shape[-2:]
-        request = replace(request, downscale=max(1.0, max(height, width) / size))
-    loaded = request.load(out, say, source)
-    height, width = loaded.train.images.shape[-2:]
-    if max(height, width) < SMALLEST:
-        fault = (f"at least {SMALLEST} pixels", f"photos of {width}x{height}")
-        if downscale is None:  # a size that is too small is refused before
-            raise DataError(scene, "images", *fault)
-        raise ArgumentError("downscale", *fault)
-    kept = f"{quantity(len(loaded.train), 'training photo')} of {width}x{height}"
-    say(f"{printable(scene)}: {kept}, {len(loaded.test) or 'none'} held out")
-    with on_ctrl_c("the cameras that were found are kept" if unposed else ""):
-        held_out: dict[str, Any] = {}
-        if measure and len(loaded.train) < MIN_PHOTOS:
-            say(f"other views are not measured: --measure needs at least {MIN_PHOTOS} photos")
-        elif measure:
-            stages.begin("measurement")
-            held_out, stopped_by = measure_held_out(request, source, len(loaded.train), config, lpips, say)
-            if stopped_by:
-                say("stopped in the measurement: the fit was not begun", sys.stderr)
-                return 128 + stopped_by
-        published = fit_folder(
-            loaded, config, out, request, resume=resume, lpips=lpips, held_out=held_out, stages=stages
-        )
-    metrics = published.fit.metrics
-    say(as_text(metrics))
-    posed = out if unposed else scene
-    splat = published.folder / "splat.ply"
-    renders = out / "renders"
-    say(f"{printable(splat)}: {quantity(metrics['gaussians'], 'Gaussian')} after {quantity(metrics['steps'], 'step')}")
-    if needless := left_out(published.fit.decisions):
-        say(needless)
-    if published.signal:
-        say_next("the same command with --resume goes on where it stopped")
-        return 128 + published.signal
-    full_side = request.full_side(loaded) if is_free and preset == "auto" else None
-    more = (
-        f"the same command with --detail high fits {full_side} pixels instead of {max(height, width)}, and takes longer"
-    )
-    say_next(
-        f"open {as_line(out / 'index.html')} in a browser: the splat to look around in, and how good it is",
-        *([more] if full_side else []),
-        f"{as_line('kgs', 'render', splat, '--cameras', posed, '-o', renders)}  # pictures from every camera",
-        VIEWER.format(as_line(splat)),
-    )
-    if open_page:
-        open_in_browser(out / "index.html")
-    return 0
 
 
 def short_help(config: FitConfig) -> type[Any]:
@@ -270,15 +183,3 @@ def short_help(config: FitConfig) -> type[Any]:
     of_config = inspect.cleandoc(FitConfig.__doc__ or "").partition("Args:")[2]
     kind.__doc__ = inspect.cleandoc(fit.__doc__ or "") + of_config
     return kind
-
-
-def _check_size(size: int | str | None, downscale: float | None, unposed: bool) -> None:
-    """Raise a ValueError unless the photos can have this size."""
-    if size is not None and downscale is not None:
-        raise ArgumentError("size", "either a size or a downscale factor", "both")
-    if isinstance(size, str) and re.fullmatch(r"field|images(_\d+)?", size) is None:
-        raise ArgumentError("size", "pixels, field or a folder as images_8", quoted(size))
-    if isinstance(size, str) and unposed:
-        raise ArgumentError("size", "pixels for photos without camera poses", quoted(size))
-    if isinstance(size, int):
-        check_side(size)

@@ -4,16 +4,34 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kgs._support.errors import DataError, listed, printable
+from kgs._support.errors import ArgumentError, DataError, listed, printable
+from kgs._support.json_files import read_json
 from kgs.app.console import say
+from kgs.app.scene_request import SceneRequest
 from kgs.datasets.source import SceneSource
 from kgs.fit.config import Recipe
+
+from .checks import check_results
 
 if TYPE_CHECKING:
     import torch
 
     from kgs.datasets.scene import Scene
     from kgs.fit.fit import Fit
+
+
+def open_splat(splat: Path, cameras: Path | None) -> tuple[Path, SceneSource]:
+    """The PLY file of a splat, and its scene: the one that is named, or that of the fit whose folder this is."""
+    if not splat.is_dir():
+        if cameras is None:
+            raise ArgumentError("cameras", "the scene of the PLY file", "none")
+        return splat, SceneSource(cameras)
+    check_results(splat)
+    if cameras is None:
+        path = splat / "config.json"
+        request = read_json(path).get("request")
+        cameras = splat / SceneRequest.from_dict(request if isinstance(request, dict) else {}, path).scene
+    return splat / "splat.ply", SceneSource(cameras)
 
 
 def load_cameras(source: SceneSource, downscale: float | None = None, photos: bool = False, **options: Any) -> "Scene":

@@ -9,7 +9,7 @@ from kgs.app.console import as_line, open_in_browser, say, say_next
 from kgs.fit.config import Backend, Background
 
 from .checks import check_file, check_photos_of, check_roll, check_side
-from .inputs import load_cameras, load_splat, options_of_fit
+from .inputs import load_cameras, load_splat, open_splat, options_of_fit
 from .options import Flag, IfGiven, Open, Out
 from .tools import load_tools
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 
 def page(
-    ply: Path,
+    splat: Path,
     /,
     *,
-    cameras: Path,
     out: Out = Path("index.html"),
+    cameras: IfGiven[Path] = None,
     size: IfGiven[int] = None,
     downscale: IfGiven[float] = None,
     background: Background = "black",
@@ -35,14 +35,14 @@ def page(
     """Write a page that shows a splat, in a viewer and beside the photos of a scene.
 
     For example:
-      kgs page fern-3/splat.ply --cameras fern -o fern.html
+      kgs page fern-3 -o fern.html --no-photos
       kgs page lego.ply --cameras lego -o lego.html --background white
 
     Args:
-        ply: a 3DGS PLY file.
-        cameras: the scene whose cameras and photos to use: the folder of the results of kgs fit, or one of LLFF,
-            COLMAP, Blender or nerfstudio.
+        splat: the folder of the results of kgs fit, or a 3DGS PLY file.
         out: the HTML file to write.
+        cameras: the scene whose cameras and photos to use (folder of LLFF, COLMAP, Blender or nerfstudio). Unless
+            given: that of the fit.
         size: reduce the photos to this many pixels on their longer side. Unless given: to the size of the fit, where
             the splat or the scene is in the folder of one.
         downscale: reduce the photos by this factor instead.
@@ -54,7 +54,6 @@ def page(
         backend: auto: the fastest that is installed. kgs fit --help-all describes the others.
     """
     from kgs.datasets.options import check_options
-    from kgs.datasets.source import SceneSource
 
     check_roll(roll)
     check_options(downscale, None)
@@ -62,13 +61,12 @@ def page(
         raise ArgumentError("size", "either a size or a downscale factor", "both")
     if size is not None:
         check_side(size)
-    check_file(out, ".html", "page")
-    source = SceneSource(cameras)
+    check_file(out, ".html")
+    ply, source = open_splat(splat, cameras)
     check_photos_of(source)
     torch_device = load_tools(device, backend, "jinja2")
 
     from kgs._support.machine import versions
-    from kgs.app.files.publishing import replacing
     from kgs.app.page.fit_page import MAX_PICTURES, load_small, spread, write_fit_page
     from kgs.datasets import load_scene
     from kgs.losses.photometric import WINDOW
@@ -76,8 +74,7 @@ def page(
 
     options = {**options_of_fit(ply, source), "background": background}
     if size is not None:
-        whole = load_scene(source, photos=False, hold_out=0).train
-        downscale = max(1.0, max(whole.images.shape[-2:]) / size)
+        downscale = max(1.0, max(source.photo_size()) / size)
     if downscale is not None:
         options |= {"downscale": downscale, "photo_folder": ""}
     scene = load_cameras(source, **options)
@@ -90,18 +87,17 @@ def page(
     photographed = load_scene(source, len(few), hold_out=0, **options)
     pictured = in_frame_of(scene, photographed)
     fit = replace(fit, metrics={"views": evaluate(fit.render, pictured), "versions": versions()})
-    with replacing(out.parent, "page") as new:
-        cost = write_fit_page(
-            new / out.name,
-            f"{ply.stem}, {Path(cameras).resolve().name}",
-            {"": fit},
-            beside=pictured,
-            words=("photo", "test"),
-            notes=["If the splat was fitted to these photos, their PSNR says little about other views."],
-            photos=not no_photos,
-            roll=roll,
-            small=None if no_photos else load_small(source, scene, background),
-        )
+    cost = write_fit_page(
+        out,
+        f"{splat.resolve().stem}, {source.root.resolve().name}",
+        {"": fit},
+        beside=pictured,
+        words=("photo", "test"),
+        notes=["If the splat was fitted to these photos, their PSNR says little about other views."],
+        photos=not no_photos,
+        roll=roll,
+        small=None if no_photos else load_small(source, scene, background),
+    )
     level = fit.metrics["views"]["psnr"]
     measured = f", PSNR {level:.4g}" if level is not None else ""
     photographs = f"{quantity(len(scene.train), 'photo')} of {width}x{height}"

@@ -3,12 +3,12 @@
 from pathlib import Path
 
 from kgs._support.errors import DataError
-from kgs.app.console import as_line, each, say, say_next
+from kgs.app.console import as_line, say, say_next
+from kgs.app.files.results import Results
 
-from .checks import check_photos
+from .checks import check_frames
 from .options import IfGiven, Out
 from .tools import check_installed, load_tools
-from .unposed import check_frames, notes_on_photos, open_scene
 
 
 def poses(
@@ -35,23 +35,19 @@ def poses(
             masks/ beside the photos.
         seed: of the solvers.
     """
-    from kgs.app.files.publishing import UNFINISHED
-    from kgs.app.files.results_folder import has_fit
+    from kgs.app.sfm.source import Source
 
-    if open_scene(photos) is not None:
+    source = Source.open(photos)
+    if source.scene is not None:
         raise DataError(photos, "", "photos without camera poses", "a scene", advice="kgs fit takes it as it is")
-    check_frames(frames, photos)
+    check_frames(frames, source)
     check_installed("pycolmap")
-    check_photos(photos, out, frames=frames)
-    if has_fit(out) or has_fit(out / UNFINISHED):
-        raise DataError(
-            out, "", "a folder without a fit", "one, to which its cameras belong", advice="choose another folder"
-        )
-    load_tools()
+    with Results.open(out, "photos", resume=False) as results:
+        load_tools()
 
-    from kgs.app.sfm import pose_photos
+        from kgs.app.sfm.pose import pose
 
-    for note in notes_on_photos(photos, masks):
-        say(note)
-    pose_photos(photos, out, seed=seed, masks=masks, frames=frames, bar=each, say=say)
+        for note in source.notes(masks):
+            say(note)
+        pose(source, results, seed=seed, masks=masks, frames=frames)
     say_next(as_line("kgs", "fit", out, "-o", Path(f"{out.resolve().name}-fit")))

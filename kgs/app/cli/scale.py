@@ -5,6 +5,7 @@ from pathlib import Path
 
 from kgs._support.errors import ArgumentError, printable, quoted
 from kgs.app.console import as_line, say, say_next
+from kgs.app.files.results import Results
 
 from .checks import check_file, check_results
 from .options import Out
@@ -44,46 +45,40 @@ def scale(splat: Path, /, *, by: tuple[str, str, float], out: Out) -> None:
 
 def _scale_folder(folder: Path, out: Path, factor: float, length: float) -> None:
     """Write the files of a fit in the new unit; the fit stays as it is."""
-    from kgs.app.files.outputs import SPLAT_EXPORTS, check_folder
-    from kgs.app.files.publishing import check_free, replacing
-
     check_results(folder)
-    check_folder(out, make=False)
-    check_free(out, "scale", ("splat.ply", "index.html", *SPLAT_EXPORTS))
-    load_tools("cpu", "auto", "jinja2", "safetensors")
+    with Results.open(out, "scale") as results:
+        load_tools("cpu", "auto", "jinja2", "safetensors")
 
-    from kgs._support.json_files import read_json
-    from kgs.app.files.exports import write_splat_exports
-    from kgs.app.page.fit_page import write_own_page
-    from kgs.app.saved_fit import load_fit
-    from kgs.fit.scale import scaled
-    from kgs.ply import save_ply
+        from kgs._support.json_files import read_json
+        from kgs.app.files.exports import write_splat_exports
+        from kgs.app.page.fit_page import write_own_page
+        from kgs.app.saved_fit import load_fit
+        from kgs.fit.scale import scaled
+        from kgs.ply import save_ply
 
-    request, fit = load_fit(folder, say=say)
-    fit = scaled(fit, factor)
-    note = f"The splat was scaled by {factor:.6g} after the fit, for a length of {length:g}; settings are those before."
-    check_folder(out, fit.scene.root)
-    with replacing(out, "scale", all_former=True) as new:
-        save_ply(new / "splat.ply", fit.model, offset=fit.scene.offset)
-        write_splat_exports(fit, new, request.roll)
-        write_own_page(new, folder, fit, request, read_json(folder / "config.json"), remarks=[note])
+        request, fit = load_fit(folder, say=say)
+        fit = scaled(fit, factor)
+        settings = read_json(folder / "config.json")
+        note = f"The splat was scaled by {factor:.6g} after the fit, for a length of {length:g}"
+        with results.stage() as new:
+            save_ply(new / "splat.ply", fit.model, offset=fit.scene.offset)
+            write_splat_exports(fit, new, request.roll)
+            write_own_page(new, folder, fit, request, settings, remarks=[f"{note}; settings are those before."])
 
 
 def _scale_ply(ply: Path, out: Path, factor: float, near: list[float]) -> None:
     """Write a scaled PLY file; positions are read relative to a point near them, because float32 holds few digits."""
-    check_file(out, ".ply", "scaled", ply)
+    check_file(out, ".ply", ply)
     load_tools()
 
     import torch
 
-    from kgs.app.files.publishing import replacing
     from kgs.fit.scale import scaled_model
     from kgs.ply import load_ply, save_ply
 
     origin = torch.tensor(near, dtype=torch.float64)
     model = scaled_model(load_ply(ply, origin=origin), factor)
-    with replacing(out.parent, "scaled") as new:
-        save_ply(new / out.name, model, offset=factor * origin)
+    save_ply(out, model, offset=factor * origin)
 
 
 def _point(text: str) -> list[float]:

@@ -51,12 +51,12 @@ def load_tools(device: str = "cpu", backend: str = "auto", *packages: str) -> "t
     for package in packages:
         load_package(package)
     from kgs._support.machine import check_device
-    from kgs.backends import resolve
+    from kgs.backends import get_backend
 
     if device == "auto":
         return _best_device(backend)
     found = check_device(device)
-    resolve(backend, found)
+    get_backend(backend, found)
     return found
 
 
@@ -68,20 +68,20 @@ def _best_device(backend: str) -> "torch.device":
     import torch
 
     from kgs._support.machine import check_device
-    from kgs.backends import resolve
+    from kgs.backends import get_backend
 
     cpu = torch.device("cpu")
     gpu = next((kind for kind in ("cuda", "xpu") if torch.get_device_module(kind).is_available()), None)
     if gpu is not None and backend != "numba":
         try:
             found = check_device(gpu)
-            if resolve(backend, found) != "torch" or resolve(backend, cpu) == "torch":
+            if get_backend(backend, found).name != "torch" or get_backend(backend, cpu).name == "torch":
                 return found
             why = f"--device {gpu} takes the GPU, with torch's operators in place of kernels"
         except ValueError as error:
             why = printable(error)
         say(f"kgs: the CPU is used: {why}", sys.stderr)
-    resolve(backend, cpu)
+    get_backend(backend, cpu)
     return cpu
 
 

@@ -21,7 +21,7 @@ from kgs.ply import float32_moves
 
 
 def write_exports(fit: Fit, folder: Path, roll: float = 0.0) -> list[str]:
-    """Write `outputs.EXPORTS` with one of the films; returns notes that say why there is none.
+    """Write `fit_files.EXPORTS` with one of the films; returns notes that say why there is none.
 
     `roll` turns the pictures of the film, and with them what is up in the glTF file, see
     :func:`kgs.app.files.cameras.rolled`.

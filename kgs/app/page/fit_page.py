@@ -126,8 +126,7 @@ def load_small(source: SceneSource, scene: Scene, background: str) -> Views:
         background: "black" or "white".
     """
     count = len(in_strip(scene.train.names))
-    whole = load_scene(source, count, hold_out=0, photos=False).train
-    shrink = max(1.0, min(whole.images.shape[-2:]) / _SMALL_PIXELS)
+    shrink = max(1.0, min(source.photo_size()) / _SMALL_PIXELS)
     return load_scene(source, count, shrink, hold_out=0, background=background).train
 
 

@@ -1,9 +1,10 @@
 """Finds the photos in a user's folder; errors say what it holds instead, and what to do about it."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from kgs._support.errors import DataError, listed, quantity
-from kgs.app.files.publishing import MARKER
+from kgs.app.files.results import MARKER
 from kgs.datasets import folders
 from kgs.datasets.folders import (
     HEIC_SUFFIXES,
@@ -41,9 +42,9 @@ def find_photos(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         raise DataError(folder, "", "a folder of photos", "no such folder")
-    paths = list_photos(folder)
-    converted = _converted(folder)
-    if lost := [path for path in list_images(folder, PICTURE_SUFFIXES) if not path.exists() and path not in converted]:
+    pictures, converted = _pictures(folder)
+    paths = [path for path in pictures if path.suffix.lower() in _readable() and path.is_file()]
+    if lost := [path for path in pictures if not path.exists()]:
         raise DataError(folder, "", "photos", "links to files that are not there", advice=listed_files(lost))
     files = [path for path in sorted(folder.iterdir()) if path.is_file() and not path.name.startswith(".")]
     videos = [path for path in files if _is_video(path)]
@@ -79,18 +80,12 @@ def _is_video(path: Path) -> bool:
     return path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".")
 
 
-def list_photos(folder: Path) -> list[Path]:
-    """The photos of a folder that can be read, sorted by name; with HEIC if pi-heif is installed."""
-    converted = _converted(folder)
-    return [path for path in list_images(folder, _readable()) if path.is_file() and path not in converted]
-
-
-def notes_on(folder: Path, masks: Path | None = None) -> list[str]:
+def notes_on(folder: Path, photos: Sequence[Path], masks: Path | None = None) -> list[str]:
     """What a folder of photos holds that is not used, a sentence each; `masks` is a folder of masks that is named."""
-    notes = [*folders.unused_files(folder), *_nameless(folder), *_inner(folder, masks)]
-    if called := [path for path in list_photos(folder) if is_like_mask(path)]:
+    notes = [*folders.unused_files(folder), *_nameless(folder), *_inner(folder, photos, masks)]
+    if called := [path for path in photos if is_like_mask(path)]:
         notes.append(f"named like masks and taken for photos: {listed_files(called)}: {MASKS_ARE_IN}")
-    if converted := sorted(_converted(folder)):
+    if converted := sorted(_pictures(folder)[1]):
         files = quantity(len(converted), "raw or HEIC file")
         notes.append(f"{files} not used, the JPEG of the same name is: {listed_files(converted)}")
     return notes
@@ -106,9 +101,8 @@ def _nameless(folder: Path) -> list[str]:
     )
 
 
-def _inner(folder: Path, masks: Path | None) -> list[str]:
+def _inner(folder: Path, photos: Sequence[Path], masks: Path | None) -> list[str]:
     """A sentence about what is named like masks and not used, and one about other folders that may hold photos."""
-    photos = list_photos(folder)
     files = find_mask_files(photos, folder, masks) if photos else None
     used = [path.resolve() for path in (folder / MASKS, *filter(None, [masks]))]
     inner = [path for path in sorted(folder.iterdir()) if path.is_dir() and path.resolve() not in used]
@@ -120,10 +114,13 @@ def _inner(folder: Path, masks: Path | None) -> list[str]:
     return notes
 
 
-def _converted(folder: Path) -> set[Path]:
-    """Raw and HEIC files of photos that are also there, by the same stem, in a format that kgs always reads."""
-    stems = {path.stem.lower() for path in list_images(folder)}
-    return {path for path in list_images(folder, UNREADABLE_SUFFIXES) if path.stem.lower() in stems}
+def _pictures(folder: Path) -> tuple[list[Path], set[Path]]:
+    """The pictures of a folder; and the raw and HEIC files that are also there, by the same stem, as a JPEG or PNG."""
+    pictures = list_images(folder, PICTURE_SUFFIXES)
+    stems = {path.stem.lower() for path in pictures if path.suffix.lower() in IMAGE_SUFFIXES}
+    of_others = [path for path in pictures if path.suffix.lower() in UNREADABLE_SUFFIXES]
+    converted = {path for path in of_others if path.stem.lower() in stems}
+    return [path for path in pictures if path not in converted], converted
 
 
 def _readable() -> tuple[str, ...]:

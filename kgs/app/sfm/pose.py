@@ -18,11 +18,11 @@ from kgs._support.errors import DataError, printable
 from kgs._support.json_files import read_json, write_json
 from kgs._support.machine import versions
 from kgs._support.progress import ProgressBar, silent
-from kgs.app.console import say
-from kgs.app.files.locks import locked
+from kgs.app.console import each, say
+from kgs.app.files.fit_files import has_fit
 from kgs.app.files.outputs import png_names
-from kgs.app.files.publishing import UNFINISHED, complete, discard, replacing
-from kgs.app.files.results_folder import check_no_fit
+from kgs.app.files.results import Results
+from kgs.datasets.folders import CAMERAS_REPORT as REPORT
 from kgs.datasets.image_file import color_notes
 
 from .accept import (
@@ -35,15 +35,18 @@ from .accept import (
     accepted_cameras,
     say_left_out,
 )
-from .find import find_photos, find_video
 from .map import Cameras, quiet_pycolmap
 from .match import exif_focal
 from .pycolmap_processes import check_space
 from .read import FILM_DIAGONAL, OpenPhoto, Photo, blurred, open_photos, read_photos, unlike_others
+from .source import Source
 from .video import take_frames
-from .workspace import IMAGES, MASKS, MODEL, REPORT, check_workspace, is_reusable
 from .write import level_and_scale, upright, write_images, write_masks, write_model
 
+IMAGES = "images"
+MASKS = "masks"
+MODEL = "sparse/0"
+_MODEL_FILES = ("cameras", "images", "points3D")
 SETTINGS = 9  # increased by every change after which the same photos give other files
 
 
@@ -54,7 +57,6 @@ def pose_photos(
     seed: int = 0,
     masks: str | PathLike[str] | None = None,
     frames: int | None = None,
-    wait: bool = False,
     bar: ProgressBar = silent,
     say: Callable[[str], None] = say,
 ) -> dict[str, Any]:
@@ -78,8 +80,6 @@ def pose_photos(
             What is black is not matched, and `out` gets the masks in `masks`.
         seed: of the solvers. The same photos and seed give the same files, but for the times in photos.json.
         frames: the number of frames that are taken from a video; see :func:`kgs.app.sfm.video.take_frames`.
-        wait: write new files to the folder `unfinished` in `out`, until a fit to them is done: a former one in `out`
-            belongs to the former cameras.
         bar: wraps the loops to show their progress, see :mod:`kgs._support.progress`.
         say: called with each line for the user.
 
@@ -97,58 +97,103 @@ def pose_photos(
         ModuleNotFoundError: pycolmap is not installed (extra `sfm`).
         OSError: a result cannot be written.
     """
-    folder = Path(folder)
-    out = Path(out)
-    options: dict[str, Any] = {"seed": seed, "masks": masks, "wait": wait, "bar": bar, "say": say}
-    if video := find_video(folder):
-        return _pose_video(video, out, frames, options)
+    with Results.open(Path(out), "photos", resume=False) as results:
+        masks = None if masks is None else Path(masks)
+        return pose(Source.unposed(Path(folder)), results, seed=seed, masks=masks, frames=frames, bar=bar, say=say)
+
+
+def pose(
+    source: Source,
+    results: Results,
+    *,
+    seed: int,
+    masks: Path | None,
+    frames: int | None,
+    for_fit: bool = False,
+    bar: ProgressBar = each,
+    say: Callable[[str], None] = say,
+) -> dict[str, Any]:
+    """As :func:`pose_photos`, in a folder that is open.
+
+    Args:
+        source: the photos or the video.
+        results: the folder.
+        seed: of the solvers.
+        masks: the folder of their masks.
+        frames: the number of frames that are taken from a video.
+        for_fit: write new files to `results.work`, until a fit to them is done: a former one in the folder belongs to
+            the former cameras.
+        bar: wraps the loops to show their progress.
+        say: called with each line for the user.
+    """
+    if source.video is not None:
+        return _pose_video(source.video, results, frames, seed=seed, masks=masks, for_fit=for_fit, bar=bar, say=say)
     with quiet_pycolmap():  # a missing package is an error before any work
         pass
-    paths = find_photos(folder)
-    check_workspace(out, paths)
-    opened = open_photos(paths, None if masks is None else Path(masks))
+    if source.path.resolve().is_relative_to(results.out.resolve()):
+        raise DataError(results.out, "", "another folder than that of the photos", advice="choose another folder")
+    opened = open_photos([*source.photos], masks)
     inputs = {
         "settings": SETTINGS,
         "seed": seed,
         "sha256": {photo.name: photo.sha256 for photo in opened},
         "masks_sha256": {photo.name: sha256(photo.mask.file.load()).hexdigest() for photo in opened if photo.mask},
     }
-    out.mkdir(parents=True, exist_ok=True)
-    with locked(out):
-        complete(out)
-        new_folder = out / UNFINISHED if wait else out
-        posed = next((path for path in (new_folder, out) if is_reusable(path, inputs)), None)
-        is_reused = posed is not None
-        if posed is None:
-            posed = new_folder
-            if wait:
-                check_no_fit(posed)  # it is one of other cameras
-            try:
-                with replacing(posed, "photos", all_former=True) as new:
-                    write_json(new / REPORT, inputs | find_cameras(opened, new, seed % 2**31, bar, say))
-            except BaseException:
-                if wait:
-                    discard(posed, "photos")
-                raise
-        else:
-            say(f"cameras: those in {printable(posed)} are of the same {len(paths)} photos and are used again")
-        report = read_json(posed / REPORT)
-        if is_reused:
+    for folder in (results.work, results.out) if for_fit else (results.out,):
+        if (report := _reusable_report(folder, inputs)) is not None:
+            say(f"cameras: those in {printable(folder)} are of the same {len(opened)} photos and are used again")
             say_left_out(report.get("left_out", {}), say)
-        return {**report, "reused": is_reused, "folder": str(posed)}
+            return {**report, "reused": True, "folder": str(folder)}
+    with _new_folder(results, for_fit) as new:
+        report = inputs | find_cameras(opened, new, seed % 2**31, bar, say)
+        write_json(new / REPORT, report)
+    return {**report, "reused": False, "folder": str(results.work if for_fit else results.out)}
 
 
-def _pose_video(video: Path, out: Path, frames: int | None, options: dict[str, Any]) -> dict[str, Any]:
+def _pose_video(video: Path, results: Results, frames: int | None, **options: Any) -> dict[str, Any]:
     """Find the cameras of a video's frames; errors about these name the video."""
     with TemporaryDirectory(prefix="kgs-") as name:
         folder = Path(name) / video.stem
         folder.mkdir()
-        take_frames(video, folder, frames, options["bar"], options["say"])
+        photos = take_frames(video, folder, frames, options["bar"], options["say"])
         try:
-            return pose_photos(folder, out, **options)
+            return pose(Source(folder, photos=tuple(photos)), results, frames=None, **options)
         except DataError as error:
             path = video if Path(error.path) == folder else error.path
             raise type(error)(path, error.key, error.expected, error.got, advice=error.advice) from error
+
+
+def _reusable_report(folder: Path, inputs: dict[str, Any]) -> dict[str, Any] | None:
+    """The report of a former run with the same inputs, whose files are there."""
+    try:
+        report = read_json(folder / REPORT)
+    except DataError:
+        return None
+    if any(report.get(key, {}) != inputs[key] for key in inputs):
+        return None
+    images = [photo["image"] for photo in report["photos"].values()]
+    names = [f"{IMAGES}/{image}" for image in images] + [f"{MODEL}/{name}.bin" for name in _MODEL_FILES]
+    names += [f"{MASKS}/{image}.png" for image in images] if inputs["masks_sha256"] else []
+    return report if all((folder / name).is_file() for name in names) else None
+
+
+@contextmanager
+def _new_folder(results: Results, for_fit: bool) -> Iterator[Path]:
+    """The folder for new files: that of a new fit, which nothing remains in after an error, or one to be published."""
+    if not for_fit:
+        with results.stage() as new:
+            yield new
+        return
+    if has_fit(results.work):
+        raise DataError(results.work, "", "no fit", "one of other photos that is not done", advice="remove this folder")
+    results.begin()
+    results.discard("photos")
+    results.work.mkdir(exist_ok=True)
+    try:
+        yield results.work
+    except BaseException:
+        results.discard("photos")
+        raise
 
 
 def find_cameras(

@@ -24,73 +24,20 @@ Rules that keep the kernels fast. Breaking any of them cost a measured factor of
 import torch
 
 from kgs._support.extras import installing
-from kgs.backends.base import (
-    ActivationStage,
-    Backend,
-    BlendingStage,
-    CompositingCall,
-    Compositor,
-    LossStage,
-    MomentsStage,
-    ProjectionStage,
+from kgs.backends.table import Backend, Lazy
+
+# for pinhole cameras: others go to torch, inside the call
+NUMBA = Backend(
+    "numba",
+    devices=("cpu",),
+    dtypes=(torch.float32,),
+    package=("numba", f"run {installing('fast')}"),
+    tile_size=8,  # a constant of the kernels
+    max_width=2**18 - 8,  # columns of tiles, and how many, are numbers of 15 bits
+    max_absgrad_features=8,  # a block: sums of absolute values of several would be added up
+    project=Lazy("kgs.backends.cpu.projection:project"),
+    compositor=Lazy("kgs.backends.cpu.compositing:CpuCompositor"),
+    loss=Lazy("kgs.backends.cpu.loss:loss"),
+    loss_gradient=Lazy("kgs.backends.cpu.loss:loss_gradient"),
+    local_moments=Lazy("kgs.backends.cpu.loss:local_moments"),
 )
-
-
-class CpuBackend(Backend):
-    """Kernels for pinhole cameras, tiles of 8 x 8 pixels and the loss; other cameras go to torch, inside the call."""
-
-    name = "numba"
-    devices = ("cpu",)
-    dtypes = (torch.float32,)
-    tile_size = 8  # a constant of the kernels
-    package = ("numba", f"run {installing('fast')}")
-    has_loss = True
-    has_moments = True
-
-    def covers_compositing(self, call: CompositingCall) -> bool:
-        """Only its own tile size, no `chunk_size`, and of many features no `absgrad`: blocks would be added up."""
-        narrow = call.projected.image_size[1] <= 2**18 - 8  # columns of tiles, and how many, are numbers of 15 bits
-        one_block = not call.options.absgrad or call.features.shape[1] <= 8
-        return call.options.tile_size in (None, self.tile_size) and call.chunk_size is None and narrow and one_block
-
-    @property
-    def activate(self) -> ActivationStage:
-        """See `Backend.activate`."""
-        from kgs.backends.torch.activation import activate
-
-        return activate
-
-    @property
-    def project(self) -> ProjectionStage:
-        """See `Backend.project`."""
-        from .projection import project
-
-        return project
-
-    @property
-    def compositor(self) -> type[Compositor]:
-        """See `Backend.compositor`."""
-        from .compositing import CpuCompositor
-
-        return CpuCompositor
-
-    @property
-    def blend(self) -> BlendingStage:
-        """See `Backend.blend`."""
-        from kgs.backends.torch.blending import blend
-
-        return blend
-
-    @property
-    def loss(self) -> LossStage:
-        """See `Backend.loss`."""
-        from .loss import CpuLoss
-
-        return CpuLoss()
-
-    @property
-    def local_moments(self) -> MomentsStage:
-        """See `Backend.local_moments`."""
-        from .loss import local_moments
-
-        return local_moments

@@ -1,7 +1,6 @@
 """Compositing by the kernels: row slices one after another, and bands of each on several threads."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +10,9 @@ from kgs._support.compiled.arrays import arrays
 from kgs._support.compiled.threads import parallel_for
 from kgs._support.memory import array, empty
 from kgs._support.torch_threads import thread_count
-from kgs.backends.base import CompositingCall, CompositingInputs, Compositor, Images
 from kgs.backends.row_slices import MAX_BYTES, row_slices
+from kgs.backends.signatures import Compositor, Images, Inputs
+from kgs.types import ProjectedGaussians, RasterOptions
 
 from . import compositing_kernels as kernels
 from .binning import Band, RowSlice, TileCoverage, table_width
@@ -34,21 +34,25 @@ class _Done:
 class CpuCompositor(Compositor):
     """Compositing of one call: row slices one after another, the bands of each on several threads."""
 
-    def __init__(self, call: CompositingCall) -> None:
-        projected = call.projected
-        features = call.features
-        options = call.options
+    def __init__(
+        self,
+        projected: ProjectedGaussians,
+        features: Tensor,
+        options: RasterOptions,
+        median_depth: bool = False,
+        chunk_size: int | None = None,
+    ) -> None:
         max_bytes = options.max_bytes or MAX_BYTES
         self._blocks = _blocks(features.shape[1])
         channels = sum(width for _, width in self._blocks)
         # a span, and at most one member for it: number, row of the table, sums; an entry, and its share of what is kept
         sums_width = len(self._blocks) * kernels.ROW
-        per_span = _NUMBER * (1 + 1 + table_width(channels, call.median_depth) + sums_width)
+        per_span = _NUMBER * (1 + 1 + table_width(channels, median_depth) + sums_width)
         per_entry = _NUMBER * (1 + kernels.P // kernels.K) + 8 * kernels.STRIPS // kernels.K  # int64
         inputs = (projected.means2d, projected.factors, projected.opacities, features)
         self._size = projected.image_size
         self._cameras = projected.num_cameras
-        self._median_depth = call.median_depth
+        self._median_depth = median_depth
         self._absgrad = options.absgrad
         self._eps2d = np.float32(projected.eps2d)
         self._coverage = TileCoverage(
@@ -66,10 +70,11 @@ class CpuCompositor(Compositor):
         self._row_slices = row_slices(row_bytes.tolist(), max_bytes)
         self._threshold = np.float32(max(options.alpha_threshold, kernels.TINY))
         self._stop = np.float32(max(options.transmittance_stop, kernels.TINY))
+        self._kept: tuple[RowSlice, list[_Done]] | None = None
 
-    def forward(self, inputs: CompositingInputs, keep: bool) -> tuple[Images, Any]:
-        """See `Compositor`. One row slice is kept, several are computed again."""
-        features = inputs.features
+    def forward(self, inputs: Inputs, keep: bool) -> Images:
+        """The images, a row slice after the other; of several none is kept."""
+        features = inputs[3]
         transmittance = features.new_empty(self._cameras, 1, *self._size)
         median = features.new_empty(self._cameras, 1 if self._median_depth else 0, *self._size)
         sums = features.new_empty(self._cameras, features.shape[1], *self._size)
@@ -80,17 +85,15 @@ class CpuCompositor(Compositor):
         )
         keep_slice = keep and len(self._row_slices) == 1
         slices = [self._forward(rows, outputs, keep_slice) for rows in self._row_slices]
-        return (sums, transmittance, median), slices[0] if keep_slice else None
+        self._kept = slices[0] if keep_slice else None
+        return sums, transmittance, median
 
     def backward(
-        self,
-        inputs: CompositingInputs,
-        kept: Any,
-        grad_features: Tensor,
-        grad_transmittance: Tensor,
-        needs: tuple[bool, ...],
+        self, inputs: Inputs, grad_features: Tensor, grad_transmittance: Tensor, needs: tuple[bool, ...]
     ) -> tuple[tuple[Tensor | None, ...], Tensor | None]:
-        """See `Compositor`."""
+        """The gradients, a row slice after the other; those that were not kept are composited again."""
+        kept, self._kept = self._kept, None
+        means2d, factors, opacities, _ = inputs
         needs_moments = any(needs[:3])
         needs_features = needs[3]
         needs_absolute = self._absgrad and needs[0]
@@ -104,13 +107,12 @@ class CpuCompositor(Compositor):
             self._backward(part, done, grads, behind, totals, needs_absolute)
             del part, done  # before the next is made
         wanted = (*[needs_moments] * 3, needs_features, needs_absolute)
-        like = (*inputs, inputs.means2d)
+        like = (*inputs, means2d)
         results = [
             empty(tuple(x.shape) if want else (0, *x.shape[1:]), x) for x, want in zip(like, wanted, strict=True)
         ]
-        factors, opacities = arrays(inputs.factors, inputs.opacities)
-        moments = (self._coverage.ranks, totals, factors, opacities, self._eps2d)
-        parallel_for(thread_count(), len(inputs.means2d), kernels.fill_gradients, *moments, *arrays(*results))
+        moments = (self._coverage.ranks, totals, *arrays(factors, opacities), self._eps2d)
+        parallel_for(thread_count(), len(means2d), kernels.fill_gradients, *moments, *arrays(*results))
         gradients = tuple(x if need else None for x, need in zip(results[:4], needs, strict=True))
         return gradients, results[4] if needs_absolute else None
 

@@ -9,6 +9,7 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from kgs._support.autograd import refuse_second_derivative
 from kgs._support.compiled.arrays import Array, arrays
 from kgs._support.compiled.threads import parallel_for
 from kgs._support.memory import array, empty
@@ -25,7 +26,7 @@ from .projection_kernels import BLOCK, footprint_gradients, footprints
 def project(
     gaussians: Gaussians, cameras: Cameras, size: tuple[int, int], options: RasterOptions, colors: bool
 ) -> ProjectedGaussians:
-    """See `ProjectionStage`; what the kernels cannot do is done in torch."""
+    """Gaussians as pinhole cameras see them, by the kernels, and through other lenses in torch."""
     if not _covers(cameras) or gaussians.quats.ndim == 3 or options.near_plane < 1e-8:  # Kornia divides by no less
         return project_in_torch(gaussians, cameras, size, options, colors)
     opacities = gaussians.opacities.detach()
@@ -59,9 +60,8 @@ def project(
 
 class _Projection(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
+    def forward(*arguments: Any) -> tuple[Tensor, ...]:
         *inputs, _, _, views, frustum, harmonics = arguments
-        ctx.save_for_backward(*inputs)
         n = len(inputs[0])
         values = _fields(inputs)
         shapes = ((n, 2), (n, 6), (n,), (n,), (n, 3 if harmonics else 0), (n,))
@@ -78,23 +78,27 @@ class _Projection(torch.autograd.Function):
         means2d, factors, depths, alphas, rgb, radii, ids = joined
         factors = factors.view(-1, 2, 3)
         num_nonfinite = ids.new_tensor(int(counts[:, 1].sum()))
-        ctx.views = views
-        ctx.ids = [part[-1].numpy() for part in parts]
-        camera_ids = torch.from_numpy(np.repeat(np.arange(len(parts)), [len(x) for x in ctx.ids]))
+        camera_ids = torch.from_numpy(np.repeat(np.arange(len(parts)), [len(part[-1]) for part in parts]))
+        return means2d, factors, depths, alphas, rgb, ids, camera_ids, radii, num_nonfinite
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        *tensors, _, _, ctx.views, _, harmonics = inputs
+        ids, camera_ids = output[5:7]
+        ctx.save_for_backward(*tensors)
+        counts = np.bincount(camera_ids.numpy(), minlength=len(ctx.views))
+        ctx.ids = [part.numpy() for part in ids.split(counts.tolist())]
         by_mean, by_turn, by_scale, by_opacity, by_color, by_pose, by_lens = ctx.needs_input_grad[:7]
         by_position = by_mean or by_pose
         by_shape = by_position or by_lens or by_turn or by_scale
-        colored = harmonics and (by_color or (by_position and inputs[4].shape[1] > 1))
-        outputs = (means2d, factors, depths, alphas, rgb)
+        colored = harmonics and (by_color or (by_position and tensors[4].shape[1] > 1))
         differentiable = (by_position or by_lens, by_shape, by_position, by_opacity, colored)
-        constant = [x for x, varies in zip(outputs, differentiable, strict=True) if not varies]
-        ctx.mark_non_differentiable(*constant, ids, camera_ids, radii, num_nonfinite)
-        return *outputs, ids, camera_ids, radii, num_nonfinite
+        constant = [x for x, varies in zip(output[:5], differentiable, strict=True) if not varies]
+        ctx.mark_non_differentiable(*constant, *output[5:])
 
     @staticmethod
     def backward(ctx: Any, *gradients: Any) -> tuple[Tensor | None, ...]:
-        if torch.is_grad_enabled():
-            raise RuntimeError("project: expected backward without create_graph, footprints have no second derivative")
+        refuse_second_derivative("project")
         inputs = ctx.saved_tensors
         needs = ctx.needs_input_grad[:7]
         means, quats, scales, _, colors = _fields(inputs)

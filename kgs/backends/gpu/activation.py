@@ -5,6 +5,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kgs._support.autograd import refuse_second_derivative
+
 from .activation_kernels import activate as activate_all
 from .activation_kernels import activation_gradients
 from .launch import blocks, launch
@@ -15,11 +17,11 @@ _BLOCK = 256  # Gaussians of a program
 def activate(
     log_scales: Tensor, opacity_logits: Tensor, sh_dc: Tensor, sh_rest: Tensor, bands: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """See `ActivationStage`."""
+    """Scales, opacities and harmonics, in one launch."""
     if bands > 1:
         scales, opacities, colors = _Activation.apply(log_scales, opacity_logits, sh_dc, sh_rest, bands)
         return scales, opacities, colors
-    scales, opacities = _Activation.apply(log_scales, opacity_logits)
+    scales, opacities = _Activation.apply(log_scales, opacity_logits, None, None, 0)
     return scales, opacities, sh_dc
 
 
@@ -28,22 +30,13 @@ class _Activation(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any,
-        log_scales: Tensor,
-        opacity_logits: Tensor,
-        sh_dc: Tensor | None = None,
-        sh_rest: Tensor | None = None,
-        bands: int = 0,
+        log_scales: Tensor, opacity_logits: Tensor, sh_dc: Tensor | None, sh_rest: Tensor | None, bands: int
     ) -> tuple[Tensor, ...]:
         inputs = [x.contiguous() for x in (log_scales, opacity_logits, sh_dc, sh_rest) if x is not None]
         n = len(log_scales)
         outputs = [torch.empty_like(x) for x in inputs[:2]]
-        ctx.set_materialize_grads(False)
-        ctx.save_for_backward(*outputs)
-        ctx.rest_shape = None
         if sh_rest is not None:
             outputs.append(inputs[3].new_empty(n, bands, 3))
-            ctx.rest_shape = sh_rest.shape
         nothing = outputs[:1]  # in place of tensors of harmonics: the kernel does not touch it
         rest = 0 if sh_rest is None else 3 * sh_rest.shape[1]
         arguments = (*(inputs + 2 * nothing)[:4], n, *(outputs + nothing)[:3])
@@ -51,11 +44,16 @@ class _Activation(torch.autograd.Function):
         return tuple(outputs)
 
     @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(*output[:2])
+        ctx.rest_shape = None if inputs[3] is None else inputs[3].shape
+
+    @staticmethod
     def backward(
         ctx: Any, by_scale: Tensor | None, by_opacity: Tensor | None, by_color: Tensor | None = None
     ) -> tuple[Tensor | None, ...]:
-        if torch.is_grad_enabled():
-            raise RuntimeError("model: expected backward without create_graph, activations have no second derivative")
+        refuse_second_derivative("model")
         scales, opacities = ctx.saved_tensors
         n = len(scales)
         needs = ctx.needs_input_grad

@@ -30,6 +30,19 @@ _INTERVAL = 3.0  # seconds between two records of the log
 _log = logging.getLogger("kgs")
 
 
+def compile_ahead(run: Callable[[torch.device], object], device: torch.device) -> None:
+    """Compile for a device what a piece of code launches, but for the interpreter, which compiles nothing.
+
+    What is wrong is left to be met again when a kernel is launched.
+    """
+    if os.environ.get("TRITON_INTERPRET") == "1":
+        return
+    try:
+        compile_together(needed_launches(lambda: run(torch.device("cpu"))), device)
+    except Exception:
+        _log.debug("kernels are compiled one after another", exc_info=True)
+
+
 def needed_launches(run: Callable[[], object]) -> list[Launch]:
     """What a piece of code launches that calls kernels with tensors of a CPU; one launch of each kernel and form.
 

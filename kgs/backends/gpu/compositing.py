@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass
 from itertools import accumulate
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from kgs.backends.base import CompositingCall, CompositingInputs, Compositor, Images
 from kgs.backends.row_slices import check_fits, default_max_bytes
+from kgs.backends.signatures import Compositor, Images, Inputs
+from kgs.types import ProjectedGaussians, RasterOptions
 
 from . import entry_counts
 from .binning_kernels import count_entries, fill_entries, fill_table, list_tiles
@@ -50,17 +50,22 @@ class GpuCompositor(Compositor):
     Its constructor reads one number for each row slice that it tries; none for the first where the projection counted.
     """
 
-    def __init__(self, call: CompositingCall) -> None:
-        projected = call.projected
-        options = call.options
+    def __init__(
+        self,
+        projected: ProjectedGaussians,
+        features: Tensor,
+        options: RasterOptions,
+        median_depth: bool = False,
+        chunk_size: int | None = None,
+    ) -> None:
         fields = (projected.means2d, projected.factors, projected.opacities, projected.depths)
         means2d, factors, opacities, depths = (x.detach().contiguous() for x in fields)
         self._size = projected.image_size
         self._cameras = projected.num_cameras
         self._eps2d = projected.eps2d
         self._image_rows, self._columns = (blocks(length, SIZE) for length in self._size)
-        self._features = range(0, max(call.features.shape[1], 1), FEATURES)  # where blocks of them begin
-        self._median_depth = call.median_depth
+        self._features = range(0, max(features.shape[1], 1), FEATURES)  # where blocks of them begin
+        self._median_depth = median_depth
         self._absgrad = options.absgrad
         self._thresholds = (max(options.alpha_threshold, _TINY), max(options.transmittance_stop, _TINY))
         self._order = torch.argsort(depths, stable=True)
@@ -77,38 +82,34 @@ class GpuCompositor(Compositor):
         self._ellipses = (*ellipses, *self._size, self._image_rows)
         whole = (_add_up(counts, begins), known.entries) if known else None
         self._max_bytes = options.max_bytes or 0  # or, by how much all lists take, in `_fitting`
+        self._kept: list[_Lists] = []
         self._slices = self._fitting(0, self._cameras * self._image_rows, whole)
 
-    def forward(self, inputs: CompositingInputs, keep: bool) -> tuple[Images, Any]:
-        """See `Compositor`. Keeps as many of the first row slices as there is room for, others are computed again."""
-        features = inputs.features
+    def forward(self, inputs: Inputs, keep: bool) -> Images:
+        """The images, a row slice after the other; as many of the first are kept as there is room for."""
+        features = inputs[3]
         widths = (features.shape[1], 1, 1 if self._median_depth else 0)
         images = [features.new_empty(self._cameras, width, *self._size) for width in widths]
         number = self._number_kept() if keep else 0
-        kept = []
+        kept = list[_Lists]()
         for i, rows in enumerate(self._slices):
             lists = self._composite_rows(rows, features, images, i < number)
             if i < number:
                 kept.append(lists)
             del lists
-        return (images[0], images[1], images[2]), kept
+        self._kept = kept
+        return images[0], images[1], images[2]
 
     def backward(
-        self,
-        inputs: CompositingInputs,
-        kept: Any,
-        grad_features: Tensor,
-        grad_transmittance: Tensor,
-        needs: tuple[bool, ...],
+        self, inputs: Inputs, grad_features: Tensor, grad_transmittance: Tensor, needs: tuple[bool, ...]
     ) -> tuple[tuple[Tensor | None, ...], Tensor | None]:
-        """See `Compositor`."""
-        features = inputs.features.contiguous()
+        """The gradients, a row slice after the other; those that were not kept are composited again."""
+        kept, self._kept = self._kept, []
+        factors, opacities, features = (x.contiguous() for x in inputs[1:])
         n, channels = features.shape
         needs_absolute = self._absgrad and needs[0]
         input_grads = [x.new_empty(x.shape) for x in inputs]
         absolute = features.new_empty(n, 2) if needs_absolute else features  # to which nothing is written
-        factors = inputs.factors.contiguous()
-        opacities = inputs.opacities.contiguous()
         grads = grad_features.contiguous()
         behind = grad_transmittance.contiguous()
 

@@ -9,6 +9,7 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from kgs._support.autograd import refuse_second_derivative
 from kgs.backends.torch.projection import project as project_in_torch
 from kgs.camera import MARGIN, Cameras, whole_frame
 from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
@@ -28,7 +29,10 @@ _SUMS = 1024  # numbers that a single program takes at once
 def project(
     gaussians: Gaussians, cameras: Cameras, size: tuple[int, int], options: RasterOptions, colors: bool
 ) -> ProjectedGaussians:
-    """See `ProjectionStage`; reads how many are visible. What the kernels cannot do is done in torch."""
+    """Gaussians as pinhole cameras see them, by the kernels, and through other lenses in torch.
+
+    Reads how many are visible.
+    """
     near = options.near_plane < 1e-8  # Kornia does not divide by less
     if not isinstance(cameras, PinholeCamera) or gaussians.quats.ndim == 3 or near:
         return project_in_torch(gaussians, cameras, size, options, colors)
@@ -180,9 +184,14 @@ def _values(gaussians: Gaussians) -> list[Tensor]:
 
 class _Projection(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
-        colors, listed, harmonics = arguments[4], arguments[7], arguments[8]
-        ctx.save_for_backward(*arguments[:5])  # not the cameras: they may have been made in inference mode
+    def forward(*arguments: Any) -> tuple[Tensor, ...]:
+        listed = arguments[7]
+        return *listed.fields, listed.camera_ids, listed.ids
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        colors, listed, harmonics = inputs[4], inputs[7], inputs[8]
+        ctx.save_for_backward(*inputs[:5])  # not the cameras: they may have been made in inference mode
         ctx.set_materialize_grads(False)
         ctx.visible = listed.visible
         ctx.harmonics = harmonics
@@ -192,14 +201,12 @@ class _Projection(torch.autograd.Function):
         by_shape = by_position or by_lens or by_turn or by_scale
         colored = harmonics and (by_color or (by_position and bands > 1))
         differentiable = (by_position or by_lens, by_shape, by_position, by_opacity, colored, False)
-        constant = [x for x, varies in zip(listed.fields, differentiable, strict=True) if not varies]
-        ctx.mark_non_differentiable(*constant, listed.camera_ids, listed.ids)
-        return *listed.fields, listed.camera_ids, listed.ids
+        constant = [x for x, varies in zip(output[:6], differentiable, strict=True) if not varies]
+        ctx.mark_non_differentiable(*constant, *output[6:])
 
     @staticmethod
     def backward(ctx: Any, *gradients: Any) -> tuple[Tensor | None, ...]:
-        if torch.is_grad_enabled():
-            raise RuntimeError("project: expected backward without create_graph, footprints have no second derivative")
+        refuse_second_derivative("project")
         inputs = ctx.saved_tensors
         means, quats, scales, opacities, colors = inputs
         visible = ctx.visible

@@ -10,11 +10,11 @@ For the layers k = 1, 2, ... of a pixel, nearest first (Kerbl et al. 2023, eq. 3
     C = sum_k w_k c_k + T_end background,   w_k = T_k alpha_k
 
 with alpha below `alpha_threshold` taken as 0, and T below `transmittance_stop` taken as 0 from then on. Both rules act
-on each pixel and layer alone, so the image does not depend on tiles or steps.
+on each pixel and layer alone, so the image does not depend on tiles or chunks.
 
-The torch compositor takes K layers of many tiles in a step: q_k is the sum of two squares, each linear in x and y; an
-exponential gives the alphas, a scan over the layers T, and a sum the colours. T before each step is kept and, where
-memory allows, the alphas. The backward pass visits the steps from back to front and carries V_k, the colour along g
+The torch compositor takes K layers of many tiles in a chunk: q_k is the sum of two squares, each linear in x and y; an
+exponential gives the alphas, a scan over the layers T, and a sum the colours. T before each chunk is kept and, where
+memory allows, the alphas. The backward pass visits the chunks from back to front and carries V_k, the colour along g
 that shows from layer k on, as if the transmittance before it were 1:
 
     V_k = alpha_k (c_k . g) + (1 - alpha_k) V_{k+1},   V_end = g_T,   dL/d ln alpha_k = w_k (c_k . g - V_{k+1})
@@ -26,42 +26,3 @@ the pixels, about the centre of the Gaussian; they are summed over its tiles.
 An image that needs more than `max_bytes` is made in row slices. Where lists are long, a row slice is made in depth
 slices, nearest first, with lists only for tiles that are not yet opaque: hidden Gaussians are not listed or sorted.
 """
-
-from torch import Tensor
-
-from kgs.backends.base import ActivationStage, Backend, BlendingStage, Compositor, ProjectionStage
-
-from .activation import activate
-from .blending import blend
-from .compositing import TorchCompositor
-from .projection import project
-
-
-class TorchBackend(Backend):
-    """The vectorised rasteriser of this folder."""
-
-    name = "torch"
-
-    def covers(self, like: Tensor) -> bool:
-        """Every call."""
-        return True
-
-    @property
-    def activate(self) -> ActivationStage:
-        """See `Backend.activate`."""
-        return activate
-
-    @property
-    def project(self) -> ProjectionStage:
-        """See `Backend.project`."""
-        return project
-
-    @property
-    def compositor(self) -> type[Compositor]:
-        """See `Backend.compositor`."""
-        return TorchCompositor
-
-    @property
-    def blend(self) -> BlendingStage:
-        """See `Backend.blend`."""
-        return blend

@@ -13,7 +13,7 @@ from kgs._support.torch_threads import torch_on_all_threads
 def activate(
     log_scales: Tensor, opacity_logits: Tensor, sh_dc: Tensor, sh_rest: Tensor, bands: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """See `ActivationStage`."""
+    """Scales, opacities and harmonics, of any dtype that torch differentiates."""
     colors: Tensor = sh_dc
     if bands > 1:
         colors = _JoinedBands.apply(sh_dc, sh_rest, bands)
@@ -30,14 +30,17 @@ class _JoinedBands(torch.autograd.Function):
     """Concatenate `sh_dc` and the first bands of `sh_rest`, as `torch.cat` does, in buffers that are used again."""
 
     @staticmethod
-    def forward(ctx: Any, sh_dc: Tensor, sh_rest: Tensor, bands: int) -> Tensor:
-        ctx.rest_shape = sh_rest.shape
-        ctx.bands = bands
+    def forward(sh_dc: Tensor, sh_rest: Tensor, bands: int) -> Tensor:
         joined = empty((len(sh_dc), bands, 3), sh_dc)
         with torch_on_all_threads():
             joined[:, :1] = sh_dc
             joined[:, 1:] = sh_rest[:, : bands - 1]
         return joined
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        _, sh_rest, ctx.bands = inputs
+        ctx.rest_shape = sh_rest.shape
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:

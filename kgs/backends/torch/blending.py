@@ -5,11 +5,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kgs._support.autograd import refuse_second_derivative
 from kgs._support.memory import empty
 
 
 def blend(image: Tensor, transmittance: Tensor, background: Tensor) -> Tensor:
-    """See `BlendingStage`."""
+    """The image over a background of any shape."""
     if background.device.type != "cpu" or bool(background.isinf().any()):  # elsewhere the answer would be waited for
         # 0 where nothing shines through: 0 times an infinite background would be NaN
         background = torch.where(background.isinf() & (transmittance == 0), 0.0, background)
@@ -24,15 +25,17 @@ class _OverColor(torch.autograd.Function):
     """`addcmul` with one colour `(D,)`, with the same bits, in memory of `kgs._support.memory`."""
 
     @staticmethod
-    def forward(ctx: Any, image: Tensor, transmittance: Tensor, color: Tensor) -> Tensor:
-        ctx.save_for_backward(color)
+    def forward(image: Tensor, transmittance: Tensor, color: Tensor) -> Tensor:
         blended = empty(tuple(image.shape), image)
         return torch.addcmul(image, transmittance, color[:, None, None], out=blended)
 
     @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+        ctx.save_for_backward(inputs[2])
+
+    @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        if torch.is_grad_enabled():
-            raise RuntimeError("background: expected backward without create_graph, there is no second derivative")
+        refuse_second_derivative("background")
         (color,) = ctx.saved_tensors
         by_transmittance = None
         if ctx.needs_input_grad[1]:

@@ -2,11 +2,11 @@
 
 Tiles are the last dimension of all tensors here, and P the pixels of a tile: an operator works on the same pixel of
 many tiles side by side. A row slice is made of depth slices; within one, tiles are sorted by the length of their lists
-and cut into steps: K layers of n tiles, `(K, P, n)`, as many as fit into memory.
+and cut into chunks: K layers of n tiles, `(K, P, n)`, as many as fit into memory.
 
 There are no matrix products: torch may round them (`torch.set_float32_matmul_precision`, `torch.autocast`), and the
 order of their sums depends on sizes. Nothing is added atomically. On a CPU the layers of a pixel are added one by one,
-so that no bit of the image depends on how they were cut into steps.
+so that no bit of the image depends on how they were cut into chunks.
 """
 
 import math
@@ -19,10 +19,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from kgs.backends.base import CompositingCall, CompositingInputs, Compositor, Images
 from kgs.backends.row_slices import MAX_BYTES
+from kgs.backends.signatures import Compositor, Images, Inputs
 from kgs.covariance import footprint_table, moment_gradients
-from kgs.types import RasterOptions
+from kgs.types import ProjectedGaussians, RasterOptions
 
 from .binning import TileCoverage, TileLists
 
@@ -33,31 +33,35 @@ ALPHA_MAX = 0.99
 class DeviceSettings:
     """How work is cut for a kind of device."""
 
-    pairs: int  # of a Gaussian and a pixel in a step, at most
+    pairs: int  # of a Gaussian and a pixel in a chunk, at most
     layers: int  # entries per tile in a depth slice: few pixels need more before they are opaque
     by_layer: bool  # scans are made layer by layer: least memory is passed, and many operators are called
     may_ask: bool  # whether reading a number is cheap; on a GPU it waits until all work is done
 
 
 SETTINGS = {"cpu": DeviceSettings(2**19, 192, True, True), "cuda": DeviceSettings(2**24, 192, False, False)}
-_MIN_LAYERS = 8  # of a step with many tiles
-_ARRAYS = 9  # numbers per pair that a step holds at the same time
+_MIN_LAYERS = 8  # of a chunk with many tiles
+_ARRAYS = 9  # numbers per pair that a chunk holds at the same time
 
 
 class TorchCompositor(Compositor):
     """Compositing on every device and in every dtype."""
 
-    def __init__(self, call: CompositingCall) -> None:
-        projected = call.projected
-        features = call.features
-        options = call.options
+    def __init__(
+        self,
+        projected: ProjectedGaussians,
+        features: Tensor,
+        options: RasterOptions,
+        median_depth: bool = False,
+        chunk_size: int | None = None,
+    ) -> None:
         self._settings = SETTINGS.get(features.device.type, SETTINGS["cuda"])
         tile_size = options.tile_size or 8
         number = features.element_size()
         arrays = _ARRAYS + 3 * options.absgrad
         max_bytes = options.max_bytes or MAX_BYTES
-        step_bytes = min(self._settings.pairs * arrays * number, max_bytes // 4)
-        budget = max_bytes - step_bytes
+        chunk_bytes = min(self._settings.pairs * arrays * number, max_bytes // 4)
+        budget = max_bytes - chunk_bytes
         # working memory of a Gaussian in a row of tiles; and in a tile: lists, sorting, gradients, sum, saved T
         width = 8 + 2 * features.shape[1] + 4 * options.absgrad + tile_size**2 // 8
         per_span = 32 + 16 * number
@@ -70,13 +74,14 @@ class TorchCompositor(Compositor):
         self._spare = budget - lists_bytes if len(self._row_slices) == 1 else 0  # to keep alphas
         self._image_size = projected.image_size
         self._eps2d = projected.eps2d
-        self._depths = projected.depths.detach() if call.median_depth else None
-        self._cut = Cut(step_bytes // (arrays * number), call.chunk_size)
+        self._depths = projected.depths.detach() if median_depth else None
+        self._cut = Cut(chunk_bytes // (arrays * number), chunk_size)
         self._thresholds = Thresholds.of(options, features.dtype)
         self._absgrad = options.absgrad
+        self._kept: Any = None  # transmittance, and depth slices with their ranks
 
-    def forward(self, inputs: CompositingInputs, keep: bool) -> tuple[Images, Any]:
-        """See `Compositor`. One row slice is kept, several are computed again."""
+    def forward(self, inputs: Inputs, keep: bool) -> Images:
+        """The images, a row slice after the other; of several none is kept."""
         keep = keep and len(self._row_slices) == 1
         results = [self._composite_rows(inputs, rows, keep) for rows in self._row_slices]
         canvases = [canvas for canvas, _ in results]
@@ -84,17 +89,14 @@ class TorchCompositor(Compositor):
         grid = self._coverage.grid
         size = self._image_size
         images = (to_images(features, grid, size), to_images(transmittance, grid, size), to_images(median, grid, size))
-        return images, results[0][1] if keep else None
+        self._kept = results[0][1] if keep else None
+        return images
 
     def backward(
-        self,
-        inputs: CompositingInputs,
-        kept: Any,
-        grad_features: Tensor,
-        grad_transmittance: Tensor,
-        needs: tuple[bool, ...],
+        self, inputs: Inputs, grad_features: Tensor, grad_transmittance: Tensor, needs: tuple[bool, ...]
     ) -> tuple[tuple[Tensor | None, ...], Tensor | None]:
-        """See `Compositor`."""
+        """The gradients, a row slice after the other; those that were not kept are composited again."""
+        kept, self._kept = self._kept, None
         coverage = self._coverage
         grads = to_tiles(grad_features, coverage.grid, coverage.tile_size)
         behind = to_tiles(grad_transmittance, coverage.grid, coverage.tile_size)
@@ -111,13 +113,12 @@ class TorchCompositor(Compositor):
         moments, absolute, features = total.split(wanted.widths(grads.shape[0]), 1)
         gradients: tuple[Tensor | None, ...] = (None, None, None, features)
         if wanted.moments:
-            factors = inputs.factors.index_select(0, coverage.ids)
-            opacities = inputs.opacities.index_select(0, coverage.ids)
+            factors, opacities = (x.index_select(0, coverage.ids) for x in inputs[1:3])
             gradients = (*moment_gradients(moments, factors, opacities, self._eps2d), features)
 
         def spread(value: Tensor) -> Tensor:
             """From the Gaussians that reach a tile to all, 0 for the others."""
-            return value.new_zeros(inputs.means2d.shape[0], *value.shape[1:]).index_copy_(0, coverage.ids, value)
+            return value.new_zeros(inputs[0].shape[0], *value.shape[1:]).index_copy_(0, coverage.ids, value)
 
         needed = zip(gradients, needs, strict=True)
         return (
@@ -125,16 +126,15 @@ class TorchCompositor(Compositor):
             spread(absolute) if wanted.absolute else None,
         )
 
-    def _composite_rows(self, inputs: CompositingInputs, rows: tuple[int, int], keep: bool) -> tuple["Canvas", Any]:
+    def _composite_rows(self, inputs: Inputs, rows: tuple[int, int], keep: bool) -> tuple["Canvas", Any]:
         """A row slice, one depth slice after the other until all pixels are opaque, and what `backward` needs."""
         coverage = self._coverage
         tiles = (rows[1] - rows[0]) * coverage.grid[1]
         pixels = coverage.tile_size**2
-        like = inputs.means2d
+        like, features = inputs[0], inputs[3]
         transmittance = like.new_ones(1, pixels, tiles)
         median = like.new_zeros(0 if self._depths is None else 1, pixels, tiles)
-        features = like.new_zeros(inputs.features.shape[1], pixels, tiles)
-        canvas = (transmittance, median, features)
+        canvas = (transmittance, median, like.new_zeros(features.shape[1], pixels, tiles))
         spans = coverage.spans(*rows)
         spare = self._spare
         live = None
@@ -153,8 +153,8 @@ class TorchCompositor(Compositor):
                     break
         return canvas, (transmittance, slices) if keep else None
 
-    def _gaussians(self, inputs: CompositingInputs, ids: Tensor) -> "Columns":
-        """What steps need of some Gaussians, followed by a dummy that is never seen."""
+    def _gaussians(self, inputs: Inputs, ids: Tensor) -> "Columns":
+        """What chunks need of some Gaussians, followed by a dummy that is never seen."""
         means2d, factors, opacities, features = (x.index_select(0, ids) for x in inputs)
         table = F.pad(footprint_table(means2d, factors, opacities, self._eps2d), (0, 1))
         table[0, -1] = -torch.inf
@@ -210,7 +210,7 @@ class Thresholds:
 
 
 @dataclass
-class Step:
+class Chunk:
     """K layers of n tiles, and what the backward pass needs of them."""
 
     tiles: slice  # of the sorted tiles
@@ -223,28 +223,28 @@ class Step:
 
 @dataclass(frozen=True)
 class Cut:
-    """How lists are cut into steps."""
+    """How lists are cut into chunks."""
 
     pairs: int  # of a Gaussian and a pixel, at most
     layers: int | None  # K; None chooses
 
-    def __call__(self, lengths: Sequence[int], pixels: int) -> list[Step]:
-        """The steps of tiles with lists of these lengths, in descending order."""
+    def __call__(self, lengths: Sequence[int], pixels: int) -> list[Chunk]:
+        """The chunks of tiles with lists of these lengths, in descending order."""
         max_tiles = max(1, self.pairs // (pixels * (self.layers or _MIN_LAYERS)))
-        steps = []
+        chunks = []
         for begin in range(0, len(lengths), max_tiles):
             end = min(begin + max_tiles, len(lengths))
             first = 0
             while first < lengths[begin]:
                 while lengths[end - 1] <= first:
                     end -= 1
-                # as many layers as a quarter of the lists still has: the longest take another step, with few tiles
+                # as many layers as a quarter of the lists still has: the longest take another chunk, with few tiles
                 fitting = max(self.pairs // (pixels * (end - begin)), 1)
                 wanted = max(lengths[begin + (end - begin) // 4] - first, fitting // 4)
                 layers = self.layers or min(wanted, fitting, lengths[begin] - first)
-                steps.append(Step(slice(begin, end), first, layers))
+                chunks.append(Chunk(slice(begin, end), first, layers))
                 first += layers
-        return steps
+        return chunks
 
 
 class DepthSlice:
@@ -265,8 +265,8 @@ class DepthSlice:
         self._starts = lists.offsets[:-1].index_select(0, self._tiles)
         self._ends = lists.offsets[1:].index_select(0, self._tiles)
         pixels = lists.tile_size**2
-        self._steps = cut(counts, pixels)
-        pairs = pixels * sum(step.layers * (step.tiles.stop - step.tiles.start) for step in self._steps)
+        self._chunks = cut(counts, pixels)
+        pairs = pixels * sum(chunk.layers * (chunk.tiles.stop - chunk.tiles.start) for chunk in self._chunks)
         self.alpha_bytes = pairs * gaussians.table.element_size()  # to keep all alphas
         self._entries = F.pad(lists.entries, (0, 1), value=lists.ids.shape[0])
         # coordinates of the columns and rows of pixels of each tile, (side, tiles)
@@ -278,20 +278,20 @@ class DepthSlice:
         self._clamps = self._may(gaussians.table[0] > math.log(ALPHA_MAX))
 
     def composite(self, canvas: Canvas, keep: bool, keep_alphas: bool) -> None:
-        """Add the layers to the tiles of a canvas, front to back; with `keep` each step keeps what `backward` needs."""
+        """Add the layers to the tiles of a canvas, front to back; with `keep` chunks keep what `backward` needs."""
         state = [x.index_select(2, self._tiles) for x in canvas]
-        for step in self._steps:
-            transmittance, median, features = (x[:, :, step.tiles] for x in state)
-            _, ids = self._entries_of(step)
-            alpha = self._alphas(*self._offsets(step, ids))
+        for chunk in self._chunks:
+            transmittance, median, features = (x[:, :, chunk.tiles] for x in state)
+            _, ids = self._entries_of(chunk)
+            alpha = self._alphas(*self._offsets(chunk, ids))
             layers = self._transmittances(alpha, transmittance[0])
             ended = self._may(layers[-1] <= self._thresholds.transmittance)
             if ended:  # T never grows, so cutting afterwards is cutting at each layer
                 F.threshold(layers, self._thresholds.transmittance, 0.0, inplace=True)
             if keep:
-                step.before = transmittance[0].clone()
-                step.alpha = alpha if keep_alphas else None
-                step.ended = ended
+                chunk.before = transmittance[0].clone()
+                chunk.alpha = alpha if keep_alphas else None
+                chunk.ended = ended
             if self._gaussians.depths is not None:
                 crossing = (layers[:-1] >= 0.5) & (layers[1:] < 0.5)
                 depths = self._gaussians.depths.index_select(0, ids.view(-1)).view_as(ids)
@@ -312,23 +312,23 @@ class DepthSlice:
         own_grads = grads.index_select(2, self._tiles)
         own_behind = behind.index_select(1, self._tiles)
         rows = grads.new_zeros(self._entries.shape[0], width)  # of each entry, and one for what is beyond the lists
-        while self._steps:
-            step = self._steps.pop()  # whose memory is free afterwards
-            positions, ids = self._entries_of(step)
-            pixels = own_grads[:, :, step.tiles]
-            sums = self._step_sums(step, ids, pixels, own_behind[:, step.tiles], wanted)
+        while self._chunks:
+            chunk = self._chunks.pop()  # whose memory is free afterwards
+            positions, ids = self._entries_of(chunk)
+            pixels = own_grads[:, :, chunk.tiles]
+            sums = self._chunk_sums(chunk, ids, pixels, own_behind[:, chunk.tiles], wanted)
             rows.index_copy_(0, positions.view(-1), torch.stack(sums, -1).view(-1, width))
         behind.index_copy_(1, self._tiles, own_behind)
         # each entry once, in the order of the Gaussians: a sum in fixed order, without atomics
         return F.embedding_bag(lists.by_gaussian, rows, lists.gaussian_offsets, mode="sum")
 
-    def _step_sums(self, step: Step, ids: Tensor, grads: Tensor, behind: Tensor, wanted: Wanted) -> list[Tensor]:
-        """What is wanted of the entries of a step, each `(K, n)`; `behind` moves before the step."""
-        table, dx, dy = self._offsets(step, ids)
-        alpha = self._alphas(table, dx, dy) if step.alpha is None else step.alpha
-        assert step.before is not None
-        transmittance = self._transmittances(alpha, step.before)
-        if step.ended:  # nothing counts behind the stop
+    def _chunk_sums(self, chunk: Chunk, ids: Tensor, grads: Tensor, behind: Tensor, wanted: Wanted) -> list[Tensor]:
+        """What is wanted of the entries of a chunk, each `(K, n)`; `behind` moves before the chunk."""
+        table, dx, dy = self._offsets(chunk, ids)
+        alpha = self._alphas(table, dx, dy) if chunk.alpha is None else chunk.alpha
+        assert chunk.before is not None
+        transmittance = self._transmittances(alpha, chunk.before)
+        if chunk.ended:  # nothing counts behind the stop
             F.threshold(transmittance, self._thresholds.transmittance, 0.0, inplace=True)
             alpha.mul_(transmittance[:-1].sign())
         weights = alpha * transmittance[:-1]
@@ -349,22 +349,22 @@ class DepthSlice:
             sums += [torch.mul(weights, grad, out=product).sum(1) for grad in grads]
         return sums
 
-    def _entries_of(self, step: Step) -> tuple[Tensor, Tensor]:
-        """Where the entries of a step are in the lists, and their Gaussians, `(K, n)`; beyond a list the dummy."""
-        layers = torch.arange(step.first, step.first + step.layers, device=self._starts.device)
-        positions = self._starts[step.tiles] + layers[:, None]
-        positions = positions.where(positions < self._ends[step.tiles], self._entries.shape[0] - 1)
+    def _entries_of(self, chunk: Chunk) -> tuple[Tensor, Tensor]:
+        """Where the entries of a chunk are in the lists, and their Gaussians, `(K, n)`; beyond a list the dummy."""
+        layers = torch.arange(chunk.first, chunk.first + chunk.layers, device=self._starts.device)
+        positions = self._starts[chunk.tiles] + layers[:, None]
+        positions = positions.where(positions < self._ends[chunk.tiles], self._entries.shape[0] - 1)
         return positions, self._entries.index_select(0, positions.view(-1)).view_as(positions)
 
     def _features(self, ids: Tensor) -> Tensor:
         """`(F, K, n)`."""
         return self._gaussians.features.index_select(1, ids.view(-1)).view(-1, *ids.shape)
 
-    def _offsets(self, step: Step, ids: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _offsets(self, chunk: Chunk, ids: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Columns of the Gaussians `(7, K, n)`, and from these to columns and rows of pixels, `(K, side, n)`."""
         table = self._gaussians.table.index_select(1, ids.view(-1)).view(-1, *ids.shape)
-        dx = self._columns[:, step.tiles] - table[1][:, None]
-        dy = self._rows[:, step.tiles] - table[2][:, None]
+        dx = self._columns[:, chunk.tiles] - table[1][:, None]
+        dy = self._rows[:, chunk.tiles] - table[2][:, None]
         return table, dx, dy
 
     def _alphas(self, table: Tensor, dx: Tensor, dy: Tensor) -> Tensor:

@@ -20,7 +20,7 @@ from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
 def project(
     gaussians: Gaussians, cameras: Cameras, size: tuple[int, int], options: RasterOptions, colors: bool
 ) -> ProjectedGaussians:
-    """See `ProjectionStage`."""
+    """Gaussians as all cameras see them, through any lens."""
     device = gaussians.means.device
     finite = finite_gaussians(gaussians)
     views = lenses(cameras, size, options.frame)

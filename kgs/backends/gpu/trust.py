@@ -1,8 +1,10 @@
-"""That the kernels have passed their check on a card is kept on disk, beside what Triton has compiled for it.
+"""Whether "auto" may take the kernels on a card: a small scene has to come out as in torch.
 
-A failed check is not kept: the next process checks again.
+That they have passed is kept on disk, beside what Triton has compiled for the card. A failed check is not kept: the
+next process checks again.
 """
 
+import functools
 import hashlib
 import json
 import os
@@ -15,11 +17,52 @@ import torch
 import triton
 from triton.runtime.cache import get_cache_manager
 
+from kgs._support.errors import cause_of, warn
 from kgs._support.version import __version__
 
 _FILE = "kgs_self_check.json"
 _DRIVERS = ("nvidia", "amdgpu", "xe", "i915")  # modules of Linux
 _SETTINGS = ("TRITON", "PTXAS", "LLVM", "AMDGCN")  # in names of variables
+
+
+def is_trusted(device: torch.device) -> bool:
+    """Whether the kernels pass :func:`passes_check`, once for each GPU; never in the interpreter."""
+    if device.type == "cpu" or os.environ.get("TRITON_INTERPRET") == "1":
+        return False
+    index = torch.get_device_module(device).current_device() if device.index is None else device.index
+    try:
+        return passes_check(torch.device(device.type, index))
+    except torch.OutOfMemoryError:  # says nothing about the kernels
+        return False
+
+
+@functools.cache
+def passes_check(device: torch.device) -> bool:
+    """Whether a small scene comes out as in torch on a device; a warning says what is wrong.
+
+    The first time on a machine the kernels are compiled, which takes seconds, and the log says how far that is.
+
+    Raises:
+        torch.OutOfMemoryError: there is no room for it now; what is raised is not remembered.
+    """
+    from kgs.backends.gpu import TRITON
+    from kgs.backends.self_check import BOUND, FITS, largest_error
+
+    if is_kept(device):
+        return True
+    try:  # twice: from their second call on kernels are launched in another way, see `.launch`
+        error = max(largest_error(TRITON, device, FITS) for _ in range(2))
+    except torch.OutOfMemoryError:
+        raise
+    except Exception as broken:  # a compiler that does not know the card, a driver: kgs can do without
+        reason = cause_of(broken)
+    else:
+        if error <= BOUND:
+            keep(device)
+            return True
+        reason = f"they differ from torch by {error:.1e}, more than {BOUND:g}"
+    warn(f"kgs: Triton's kernels are not used on {device}, torch is: {reason}")
+    return False
 
 
 def is_kept(device: torch.device) -> bool:
@@ -80,5 +123,5 @@ def _driver(card: Any) -> str:
 def _source() -> str:
     """A hash of the kernels, and of what calls and checks them."""
     folder = Path(__file__).parent
-    files = [*sorted(folder.glob("*.py")), folder.parent / "agreement.py"]
+    files = [*sorted(folder.glob("*.py")), folder.parent / "self_check.py"]
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()

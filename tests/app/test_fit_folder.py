@@ -6,8 +6,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -15,14 +13,14 @@ from typing import Any
 
 import pytest
 import torch
+from fits_in_folders import fit_in
 
 from kgs._support.errors import DataError, TrainingDiverged
 from kgs.app import fit_folder as app
 from kgs.app.cli.evaluate import evaluate
-from kgs.app.files import publishing
-from kgs.app.files.locks import locked
-from kgs.app.files.publishing import UNFINISHED, is_own, read_marker, replacing
-from kgs.app.files.results_folder import CHECKPOINT, check_fit_files
+from kgs.app.files import results as results_module
+from kgs.app.files.fit_files import CHECKPOINT, UNFINISHED
+from kgs.app.files.results import Results, read_marker
 from kgs.app.saved_fit import load_fit
 from kgs.app.scene_request import SceneRequest
 from kgs.datasets.synthetic import synthetic_scene
@@ -63,7 +61,7 @@ def done(first_fit: Path, tmp_path: Path) -> Path:
 def fit(scene: Any, config: FitConfig, out: Path, **options: Any) -> list[str]:
     """Fit; the lines that were said, unless something else listens."""
     lines: list[str] = []
-    app.fit_folder(scene, config, out, SceneRequest("/photos", 3), **{"say": lines.append} | options)
+    fit_in(scene, config, out, SceneRequest("/photos", 3), **{"say": lines.append} | options)
     return lines
 
 
@@ -83,24 +81,6 @@ def seed_of(out: Path) -> int:
     assert config["fit"]["seed"] == metrics["seed"] == load_checkpoint(out / CHECKPOINT)["config"]["seed"]
     assert len(load_fit(out)[1].model) == metrics["gaussians"]
     return int(metrics["seed"])
-
-
-def test_a_second_fit_in_the_folder_is_refused(scene: Any, tmp_path: Path) -> None:
-    with locked(tmp_path), pytest.raises(DataError, match="at work on the fit in this folder"):
-        fit(scene, CONFIG, tmp_path)
-    fit(scene, CONFIG, tmp_path)
-
-
-def test_a_killed_process_leaves_no_lock(tmp_path: Path) -> None:
-    code = "import sys, time, pathlib, kgs.app.files.locks as locks\n"
-    code += "with locks.locked(pathlib.Path(sys.argv[1])):\n    print('locked', flush=True)\n    time.sleep(60)"
-    with subprocess.Popen([sys.executable, "-c", code, tmp_path], stdout=subprocess.PIPE) as process:
-        assert process.stdout.readline()
-        with pytest.raises(DataError, match="at work"), locked(tmp_path):
-            pass
-        process.kill()
-    with locked(tmp_path):
-        pass
 
 
 def test_a_fit_that_fails_at_once_changes_nothing(scene: Any, done: Path, monkeypatch: Any) -> None:
@@ -139,7 +119,7 @@ def test_results_of_a_full_disk_are_kept_where_no_checkpoint_could_be_written(
     lines: list[str] = []
     with pytest.raises(OSError, match="space") as error:
         fit(scene, CONFIG, tmp_path, say=lines.append)
-    (held,) = (tmp_path / UNFINISHED).glob(".kgs-*/")
+    held = tmp_path / UNFINISHED
     assert error.value.filename == str(held / "test" / "test_00.png")
     assert {"splat.ply", "curve.png", "cameras.json"} <= set(os.listdir(held))
     assert f"{held}: holds the results that could be written" in lines
@@ -195,31 +175,28 @@ def test_a_forged_checkpoint_is_refused(done: Path, changes: dict[str, Any], fie
     assert (error.value.path, error.value.key) == (path, field)
 
 
-def killed_before_the_move(out: Path, patch: Any) -> None:
+def killed_before_the_move(patch: Any) -> None:
     """From now on a process is killed when all results are there, but none is in its place."""
-    plain = publishing.publish
 
-    def kill(work: Path, folder: Path) -> None:
-        if folder == out:
-            raise KeyboardInterrupt
-        plain(work, folder)
+    def kill(*_: str) -> None:
+        raise KeyboardInterrupt
 
-    patch.setattr(app, "publish", kill)
+    patch.setattr(Results, "publish", kill)
 
 
 def test_a_kill_while_files_are_moved(scene: Any, done: Path, monkeypatch: Any) -> None:
-    """At any other call: tests of publishing."""
+    """At any other call: test_results.py."""
     plain = os.replace
     calls = []
 
     def killed(source: Any, target: Any) -> None:
-        if Path(source).parent.name == UNFINISHED and Path(target).parent == done:
+        if Path(source).parent.name == ".kgs-whole" and Path(target).parent == done:
             calls.append(source)
         if len(calls) > 3:
             raise KeyboardInterrupt
         plain(source, target)
 
-    monkeypatch.setattr(publishing.os, "replace", killed)
+    monkeypatch.setattr(results_module.os, "replace", killed)
     with pytest.raises(KeyboardInterrupt):
         fit(scene, OTHER, done)
     monkeypatch.undo()
@@ -235,7 +212,7 @@ def folders(out: Path) -> list[str]:
 def test_a_kill_before_files_are_moved(scene: Any, done: Path, monkeypatch: Any) -> None:
     fewer = replace(scene, test=scene.test.select([1]))
     with monkeypatch.context() as patch, suppress(KeyboardInterrupt):
-        killed_before_the_move(done, patch)
+        killed_before_the_move(patch)
         fit(fewer, OTHER, done)
     assert json.loads((done / "metrics.json").read_text())["seed"] == 0
     assert len(list((done / "test").iterdir())) == 2
@@ -251,11 +228,11 @@ def test_cameras_that_waited_for_a_fit_come_with_it(
 ) -> None:
     """After a kill, too: a fit never shows itself beside the cameras of another one."""
     photos = done / UNFINISHED
-    with replacing(photos, "photos") as new:
-        (new / "photos.json").write_text("{}")
+    photos.mkdir()
+    (photos / "photos.json").write_text("{}")
     scene = replace(scene, root=photos if are_of_this_fit else Path("/photos"))
     with monkeypatch.context() as patch, suppress(KeyboardInterrupt):
-        killed_before_the_move(done, patch)
+        killed_before_the_move(patch)
         fit(scene, OTHER, done)
     assert not (done / "photos.json").exists()
     assert seed_of(done) == 0
@@ -285,7 +262,7 @@ def test_eval_and_a_fit_keep_out_of_each_others_way(scene: Any, done: Path, monk
     def meanwhile(*arguments: Any) -> Any:
         nonlocal refused
         for again in (lambda: fit(scene, OTHER, done), lambda: evaluate(done)):
-            with pytest.raises(DataError, match="at work on the fit in this folder"):
+            with pytest.raises(DataError, match="at work"):
                 again()
             refused += 1
         return plain(*arguments)
@@ -300,8 +277,6 @@ def test_eval_says_how_to_go_on_with_a_fit_that_was_killed(tmp_path: Path) -> No
     (tmp_path / UNFINISHED).mkdir()
     (tmp_path / UNFINISHED / CHECKPOINT).touch()
     with pytest.raises(DataError, match="kgs fit --resume"):
-        evaluate(tmp_path)
-    with locked(tmp_path), pytest.raises(DataError, match="at work on the fit"):
         evaluate(tmp_path)
 
 
@@ -331,15 +306,12 @@ def test_an_unfinished_fit_is_gone_on_with_or_the_next_one_is_refused(scene: Any
     work = done / UNFINISHED
     assert f"{done} keeps its finished fit; this one is in {work}" in lines[-1]
     assert (seed_of(done), seed_of(work)) == (0, 1)
-    assert is_own(work, "index.html")
+    assert (work / "index.html").exists()
     monkeypatch.undo()
     before = contents(done)
-    for check in (lambda: fit(scene, OTHER, done), lambda: check_fit_files(done, resume=False)):
-        with pytest.raises(
-            DataError, match="a fit that is done, got one that is not: go on with it by --resume, or remove"
-        ) as error:
-            check()
-        assert error.value.path == work
+    with pytest.raises(DataError, match="use --resume, or remove") as error:
+        fit(scene, OTHER, done)
+    assert error.value.path == work
     with pytest.raises(DataError, match="seed: expected 1") as error:  # also with the settings of the finished one
         fit(scene, CONFIG, done, resume=True)
     assert error.value.path == work / CHECKPOINT
@@ -349,33 +321,21 @@ def test_an_unfinished_fit_is_gone_on_with_or_the_next_one_is_refused(scene: Any
     assert folders(done) == ["test"]
 
 
-@pytest.mark.parametrize("name", ["cameras.json", f"{UNFINISHED}/splat.ply"])
-def test_a_file_that_the_user_writes_during_a_fit_is_not_replaced_and_no_training_lost(
-    scene: Any, done: Path, monkeypatch: Any, name: str
-) -> None:
+def test_what_the_user_writes_during_a_fit_stays(scene: Any, done: Path, monkeypatch: Any) -> None:
     """In the folder of the results and in that of the unfinished fit."""
     plain = Trainer._optimize
-    mine = done / name
-    notes = (done / "notes.txt", done / UNFINISHED / "notes.txt")
+    notes = (done / "notes.txt", done / "test" / "notes.txt", done / UNFINISHED / "notes.txt")
 
     def meanwhile(self: Trainer) -> float:
-        for path in (mine, *notes):
+        for path in notes:
             path.write_text("mine")
         return plain(self)
 
-    with monkeypatch.context() as patch:
-        patch.setattr(Trainer, "_optimize", meanwhile)
-        with pytest.raises(DataError, match=f"got {mine.name}: move it away"):
-            fit(scene, OTHER, done)
-    assert json.loads((done / "metrics.json").read_text())["seed"] == 0
-    with pytest.raises(DataError, match=f"got {mine.name}: move it away"):
-        fit(scene, OTHER, done, resume=True)
-    assert mine.read_text() == "mine"
-    mine.unlink()
-    fit(scene, OTHER, done, resume=True)
+    monkeypatch.setattr(Trainer, "_optimize", meanwhile)
+    fit(scene, OTHER, done)
     assert seed_of(done) == 1
-    assert [path.read_text() for path in notes] == ["mine", "mine"]
-    assert folders(done) == ["test", UNFINISHED]
+    assert [path.read_text() for path in notes] == ["mine"] * 3
+    assert os.listdir(done / UNFINISHED) == ["notes.txt"]
 
 
 def test_what_the_new_results_lack_goes_but_for_what_is_the_users(scene: Any, done: Path) -> None:
@@ -386,11 +346,10 @@ def test_what_the_new_results_lack_goes_but_for_what_is_the_users(scene: Any, do
     fit(replace(scene, test=scene.test.select([])), OTHER, done)
     assert folders(done) == []
     fit(scene, CONFIG, done)
-    for name in ("notes.txt", first):
-        (done / "test" / name).write_text("mine")
+    assert first in os.listdir(done / "test")
+    (done / "test" / "notes.txt").write_text("mine")
     fit(replace(scene, test=scene.test.select([])), OTHER, done)
-    assert sorted(os.listdir(done / "test")) == ["notes.txt", first]
-    assert (done / "test" / first).read_text() == "mine"
+    assert os.listdir(done / "test") == ["notes.txt"]
 
 
 def interrupt_at(step: int, patch: Any) -> None:
@@ -458,38 +417,6 @@ def test_a_finished_fit_is_trained_on(scene: Any, done: Path) -> None:
     assert json.loads((done / "metrics.json").read_text())["steps"] == 5
 
 
-@pytest.mark.parametrize(
-    ("name", "is_refused"),
-    [
-        *((f"{folder}/thesis.txt", False) for folder in (UNFINISHED, "test")),
-        *((name, True) for name in ("splat.ply", CHECKPOINT, "test", UNFINISHED)),
-        *((f"{UNFINISHED}/{name}", True) for name in ("splat.ply", CHECKPOINT)),
-    ],
-)
-def test_what_another_program_or_person_made_stays(
-    scene: Any, tmp_path: Path, monkeypatch: Any, name: str, is_refused: bool
-) -> None:
-    """Where it has the name of a result, the fit is refused before any work."""
-    mine = tmp_path / name
-    mine.parent.mkdir(exist_ok=True)
-    mine.write_text("mine")
-    if is_refused:
-        monkeypatch.setattr("kgs.fit.run.choose_points", None)
-        with pytest.raises(DataError, match="move it away|remove this folder"):
-            fit(scene, CONFIG, tmp_path)
-        assert contents(tmp_path) in ({name: b"mine"}, {name: b"mine", ".lock": b""})
-    else:
-        fit(scene, CONFIG, tmp_path)
-        assert seed_of(tmp_path) == 0
-        assert mine.read_text() == "mine"
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="a folder that even root cannot write to")
-def test_a_folder_that_cannot_be_made_is_refused_first(scene: Any) -> None:
-    with pytest.raises(DataError, match="expected a folder that results can be written to"):
-        fit(scene, CONFIG, Path("/proc/kgs"))
-
-
 @pytest.mark.slow
 def test_images_that_are_too_small_are_refused_before_any_work(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="expected at least 6x6 pixels, got 5x5"):
@@ -498,7 +425,7 @@ def test_images_that_are_too_small_are_refused_before_any_work(tmp_path: Path) -
 
 
 def test_a_loaded_fit_is_the_one_that_was_saved(scene: Any, tmp_path: Path) -> None:
-    made = app.fit_folder(scene, CONFIG, tmp_path, SceneRequest("/photos", 3), say=lambda _: None).fit
+    made = fit_in(scene, CONFIG, tmp_path, SceneRequest("/photos", 3), say=lambda _: None).fit
     request, saved = load_fit(tmp_path)
     assert request == SceneRequest("/photos", 3)
     for name in ("options", "backend", "settings", "decisions", "notes"):

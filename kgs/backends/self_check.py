@@ -10,8 +10,8 @@ from torch import Tensor
 from kgs.camera import image_size, pinhole_cameras
 from kgs.types import Gaussians, RasterOptions
 
-from .base import AdamUpdate, Backend, CompositingCall, CompositingInputs
-from .torch import TorchBackend
+from .signatures import AdamUpdate
+from .table import TORCH, Backend
 
 BOUND = 5e-5  # a larger disagreement is no rounding
 _WINDOW, _SIGMA, _WEIGHT = 11, 1.5, 0.2  # of the loss
@@ -21,7 +21,7 @@ _OPTIONS = RasterOptions(tile_size=8, alpha_threshold=1e-6, transmittance_stop=1
 
 
 @dataclass(frozen=True)
-class Step:
+class CheckCase:
     """What a training step asks of a backend.
 
     Args:
@@ -39,13 +39,14 @@ class Step:
     poses: bool = False
 
 
-EVERYTHING = Step(cameras=2, depths=True, poses=True)
-FITS = (Step(absgrad=True), Step(bands=1), Step(bands=1, poses=True))  # of fits, as they begin and as they end
+EVERYTHING = CheckCase(cameras=2, depths=True, poses=True)
+# of fits, as they begin and as they end
+FITS = (CheckCase(absgrad=True), CheckCase(bands=1), CheckCase(bands=1, poses=True))
 
 
 @torch.inference_mode(False)
 @torch.enable_grad()
-def disagreement(backend: Backend, device: torch.device, steps: tuple[Step, ...] = (EVERYTHING,)) -> float:
+def largest_error(backend: Backend, device: torch.device, cases: tuple[CheckCase, ...] = (EVERYTHING,)) -> float:
     """The largest difference from torch in float64, over the largest value of its kind.
 
     Of training steps of 32 Gaussians, among them an opaque stack: activations, images with and without a background,
@@ -54,35 +55,35 @@ def disagreement(backend: Backend, device: torch.device, steps: tuple[Step, ...]
     Args:
         backend: works in float32 on the device.
         device: where; torch is on the CPU where it has no float64 there.
-        steps: what is done.
+        cases: what is done.
     """
-    backend.compile_ahead(lambda of_cpu: run_stages(backend, of_cpu, steps), device)
+    backend.compile_ahead(lambda of_cpu: run_stages(backend, of_cpu, cases), device)
     reference_device = device if device.type in ("cpu", "cuda") else torch.device("cpu")
-    found = run_stages(backend, device, steps)
-    exact = _pictured(TorchBackend(), reference_device, steps)
-    if backend.has_loss:
+    found = run_stages(backend, device, cases)
+    exact = _pictured(TORCH, reference_device, cases)
+    if backend.loss is not None:
         exact += _exact_loss()
-    if backend.has_optimizer:
+    if backend.adam_step is not None:
         exact += _exactly_optimized()
     return max(_relative(value, expected) for value, expected in zip(found, exact, strict=True))
 
 
-def run_stages(backend: Backend, device: torch.device, steps: tuple[Step, ...]) -> list[Tensor]:
+def run_stages(backend: Backend, device: torch.device, cases: tuple[CheckCase, ...]) -> list[Tensor]:
     """What a backend finds."""
-    found = _pictured(backend, device, steps)
-    if backend.has_loss:
+    found = _pictured(backend, device, cases)
+    if backend.loss is not None:
         found += _loss(backend, device)
-    if backend.has_optimizer:
+    if backend.adam_step is not None:
         found += _optimized(backend, device)
     return found
 
 
-def _pictured(backend: Backend, device: torch.device, steps: tuple[Step, ...]) -> list[Tensor]:
+def _pictured(backend: Backend, device: torch.device, cases: tuple[CheckCase, ...]) -> list[Tensor]:
     """What the stages of every backend find."""
     found = _blend(backend, device)
-    for step in steps:
-        found += _activate(backend, device, step)
-        found += _render(backend, device, step)
+    for case in cases:
+        found += _activate(backend, device, case)
+        found += _render(backend, device, case)
     return found
 
 
@@ -95,18 +96,18 @@ def _random(*shape: int, low: float = -1.0, high: float = 1.0, seed: int = 0) ->
 
 def _dtype(backend: Backend) -> torch.dtype:
     """Float64 of torch, which defines what is right."""
-    return torch.float64 if isinstance(backend, TorchBackend) else torch.float32
+    return torch.float64 if backend is TORCH else torch.float32
 
 
-def _activate(backend: Backend, device: torch.device, step: Step) -> list[Tensor]:
+def _activate(backend: Backend, device: torch.device, case: CheckCase) -> list[Tensor]:
     """Scales, opacities and harmonics, and the gradients of what they are made of."""
-    rest = _random(8, step.bands - 1, 3, seed=1)
+    rest = _random(8, case.bands - 1, 3, seed=1)
     values = (_random(8, 3, low=-8.0), _random(8, low=-8.0, high=8.0), _random(8, 1, 3), rest)
     leaves = [x.to(device, _dtype(backend)).requires_grad_() for x in values]
     log_scales, opacity_logits, sh_dc, sh_rest = leaves
-    activated = backend.activate(log_scales, opacity_logits, sh_dc, sh_rest, step.bands)
+    activated = backend.activate(log_scales, opacity_logits, sh_dc, sh_rest, case.bands)
     weights = [_random(*x.shape, seed=2).to(x) for x in activated]
-    used = leaves if step.bands > 1 else leaves[:3]
+    used = leaves if case.bands > 1 else leaves[:3]
     return [*activated, *torch.autograd.grad(activated, used, weights)]
 
 
@@ -119,7 +120,7 @@ def _blend(backend: Backend, device: torch.device) -> list[Tensor]:
     return [blended, *torch.autograd.grad(blended, leaves, _random(2, 5, 6, 7, seed=2).to(blended))]
 
 
-def _render(backend: Backend, device: torch.device, step: Step) -> list[Tensor]:
+def _render(backend: Backend, device: torch.device, case: CheckCase) -> list[Tensor]:
     """Images, once with what gradients need and once without, and gradients."""
     dtype = _dtype(backend)
     n = 32
@@ -131,27 +132,27 @@ def _render(backend: Backend, device: torch.device, step: Step) -> list[Tensor]:
     means[:8] = torch.tensor([0.3, -0.2, 2.5], device="cpu") * torch.linspace(1.0, 1.4, 8, device="cpu")[:, None]
     scales[:8] = 0.15
     opacities[:8] = 5.0
-    values = (means, _random(n, 4, seed=3), scales, opacities, _random(n, 16, 3, seed=4)[:, : step.bands])
+    values = (means, _random(n, 4, seed=3), scales, opacities, _random(n, 16, 3, seed=4)[:, : case.bands])
     poses = torch.eye(4, device="cpu").repeat(2, 1, 1)
     poses[1, 0, 3] = 0.2
     focal = torch.tensor([[15.0, 0.0, 7.5], [0.0, 15.0, 5.5], [0.0, 0.0, 1.0]], device="cpu").repeat(2, 1, 1)
     leaves = [x.to(device, dtype).requires_grad_() for x in values]
-    extrinsics, intrinsics = (x[: step.cameras].to(device, dtype).requires_grad_(step.poses) for x in (poses, focal))
+    extrinsics, intrinsics = (x[: case.cameras].to(device, dtype).requires_grad_(case.poses) for x in (poses, focal))
     camera = pinhole_cameras(extrinsics, intrinsics, width, height)
-    varying = [*leaves, extrinsics, intrinsics] if step.poses else leaves
-    options = replace(_OPTIONS, absgrad=step.absgrad)
+    varying = [*leaves, extrinsics, intrinsics] if case.poses else leaves
+    options = replace(_OPTIONS, absgrad=case.absgrad)
     projected = backend.project(Gaussians(*leaves), camera, image_size(camera), options, True)
     features = projected.colors
-    if step.depths:
+    if case.depths:
         depths = projected.depths[:, None]
         features = torch.cat([features, depths, depths.square()], 1)
-    inputs = CompositingInputs(projected.means2d, projected.factors, projected.opacities, features)
+    inputs = (projected.means2d, projected.factors, projected.opacities, features)
     with torch.no_grad():
-        compositor = backend.compositor(CompositingCall(projected, features, options))
-        (sums, transmittance, _), kept = compositor.forward(inputs, True)
+        compositor = backend.compositor(projected, features, options)
+        sums, transmittance, _ = compositor.forward(inputs, True)
         by_sums, by_transmittance = (_random(*x.shape, seed=5).to(device, dtype) for x in (sums, transmittance))
-        gradients, absolute = compositor.backward(inputs, kept, by_sums, by_transmittance, (True,) * 4)
-        (drawn, behind, _), _ = compositor.forward(inputs, False)
+        gradients, absolute = compositor.backward(inputs, by_sums, by_transmittance, (True,) * 4)
+        drawn, behind, _ = compositor.forward(inputs, False)
     images = [sums, transmittance, drawn, behind, *([] if absolute is None else [absolute])]
     return images + list(torch.autograd.grad(inputs, varying, gradients))
 
@@ -168,8 +169,10 @@ def _loss(backend: Backend, device: torch.device) -> tuple[Tensor, Tensor]:
     x, y, mean, variance = (each.to(device, torch.float32) for each in (image, target, mean, square - mean * mean))
     window = get_gaussian_kernel1d(_WINDOW, _SIGMA, device=torch.device("cpu"), dtype=torch.float32)
     taps: list[float] = window.flatten().tolist()
-    loss, kept = backend.loss.forward(x, y, mean, variance, taps, _WEIGHT, True)
-    return loss, backend.loss.backward(kept, taps, _WEIGHT, torch.ones_like(loss))
+    assert backend.loss
+    assert backend.loss_gradient
+    loss, kept = backend.loss(x, y, mean, variance, taps, _WEIGHT, True)
+    return loss, backend.loss_gradient(kept, taps, _WEIGHT, torch.ones_like(loss))
 
 
 def _exact_loss() -> tuple[Tensor, Tensor]:
@@ -192,12 +195,15 @@ def _optimized(backend: Backend, device: torch.device) -> list[Tensor]:
     for _ in range(6):
         parameter, gradient, average, square = (x.to(device, torch.float32) for x in _parameters())
         updates.append(AdamUpdate(parameter, gradient, average, square, _LR, _STEPS))
-    backend.optimizer.adam(updates, _BETAS, _ADAM_EPS)
+    assert backend.adam_step
+    assert backend.add_gradient_norms
+    assert backend.decay_opacity
+    backend.adam_step(updates, _BETAS, _ADAM_EPS)
     logits = _parameters()[-1][:, 0].to(device, torch.float32).contiguous()
     sums, counts = logits.clone(), torch.zeros(40, dtype=torch.int64, device=device)
     ids = torch.arange(0, 40, 2, device=device)
-    backend.optimizer.add_gradient_norms(sums, counts, ids, gradient[:20, :2].contiguous(), (0.5, 2.0))
-    backend.optimizer.decay_opacity(logits, 0.9)
+    backend.add_gradient_norms(sums, counts, ids, gradient[:20, :2].contiguous(), (0.5, 2.0))
+    backend.decay_opacity(logits, 0.9)
     return [updates[-1].parameter, updates[0].exp_avg, updates[0].exp_avg_sq, sums, counts, logits]
 
 
