@@ -19,6 +19,10 @@ from .pruning import prune
 from .trainer import Trainer
 
 
+def _nothing(*_: object) -> None:
+    """The hook of a caller that adds nothing."""
+
+
 @dataclass(frozen=True)
 class Hooks:
     """What a caller adds to a fit.
@@ -33,9 +37,9 @@ class Hooks:
 
     bar: ProgressBar = silent
     make_trainer: Callable[[Scene, Plan, InitialPoints], Trainer] = Trainer
-    begun: Callable[[Trainer], object] = lambda _: None
+    begun: Callable[[Trainer], object] = _nothing
     after_step: Callable[[Trainer, float], bool] | None = None
-    done: Callable[[Trainer, Fit], object] = lambda *_: None
+    done: Callable[[Trainer, Fit], object] = _nothing
 
 
 def fit_scene(

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import pytest
 import torch
+from fits_in_folders import fit_in
 from refusals import refused
 from trainers import stop_at
 
 from kgs import ArgumentError, DataError
-from kgs.app.fit_folder import fit_folder
 from kgs.app.scene_request import SceneRequest
 from kgs.datasets import synthetic_scene
 from kgs.fit import FitConfig, Hooks, Trainer, fit_scene, make_plan, prune
@@ -37,7 +37,7 @@ def test_it_is_the_steps_that_can_be_made_by_hand(scene, whole):
 
 
 def test_kgs_fit_makes_the_same_fit(scene, whole, tmp_path):
-    published = fit_folder(scene, CONFIG, tmp_path, SceneRequest("/photos"), say=lambda _: None)
+    published = fit_in(scene, CONFIG, tmp_path, SceneRequest("/photos"), say=lambda _: None)
     assert_same_model(whole, published.fit)
     assert whole.decisions == published.fit.decisions
 
