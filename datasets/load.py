@@ -38,6 +38,8 @@ _CLOCKWISE = torch.tensor(
     device="cpu",
 )
 _VALID = 0.99  # share of a pixel that a mask keeps, above which it counts
+_ORIENTATION = 0x112  # a tag of Exif
+_SIDEWAYS = (5, 6, 7, 8)  # its values for photos that a quarter turn makes upright
 _FINE_PIXELS = 1_000_000  # of an image for the initial points: twice the width and height halves the error of depths
 
 
@@ -235,7 +237,11 @@ def _check_size(frame: Frame, width: int, height: int, scales: Sequence[_Scale])
     lens = frame.intrinsics
     if not lens.same_aspect(width, height):
         described = f"the {lens.width}x{lens.height} that {frame.source.name} describes"
-        raise DataError(frame.path, "", f"a scaled version of {described}", f"{width}x{height} pixels")
+        advice = ""
+        if lens.same_aspect(height, width) and frame.image.metadata.tags.get(_ORIENTATION) in _SIDEWAYS:
+            advice = "its Exif turns it by a quarter, and cameras have to be those of the photo as it is stored"
+        got = f"{width}x{height} pixels"
+        raise DataError(frame.path, "", f"a scaled version of {described}", got, advice=advice)
     for scale in scales:
         size = _reduced(width, height, scale.factor)
         if scale.size not in (size, size[::-1]):

@@ -80,7 +80,7 @@ def bad_call_of_gsplat(name, dtype):
     def call():
         gaussians, seen = random_gaussians(3, 0, torch.float32, None), camera()
         given = vars(gaussians) | {"viewmats": seen.extrinsics, "Ks": seen.intrinsics[:, :3, :3]}
-        tensors = given | {"covars": torch.eye(3).expand(3, 3, 3), "extra_signals": torch.rand(3, 2)}
+        tensors = given | {"covars": torch.eye(3).expand(3, 3, 3)}
         wrong = None if dtype is None else tensors[name].to(dtype)
         kgs.rasterization(**given | {name: wrong}, width=12, height=9)
 
@@ -226,7 +226,7 @@ CASES = [
     *[bad_call_of_gsplat(name, None) for name in (*FIELDS, "viewmats", "Ks")],
     *[
         bad_call_of_gsplat(name, dtype)
-        for name in (*FIELDS[1:], "viewmats", "Ks", "covars", "extra_signals")
+        for name in (*FIELDS[1:], "viewmats", "Ks", "covars")
         for dtype in (torch.float64, torch.float16, torch.int64)
     ],
     # compositing
