@@ -11,9 +11,9 @@ from kgs._support.extras import installing
 from kgs._support.machine import check_device, versions
 from kgs.backends import BACKENDS, Backend, get_backend
 from kgs.backends.self_check import BOUND, largest_error
-from kgs.camera import move_camera
+from kgs.geometry.cameras import to
+from kgs.geometry.types import RasterOptions
 from kgs.renderer import GaussianRenderer
-from kgs.types import RasterOptions
 
 from .scenes import cast, exact, gradients, layered_scene, relative_errors
 from .speed import SIZE, Cases
@@ -118,7 +118,7 @@ def _off_by(backend: str, device: torch.device) -> float:
     image, slopes = exact(scene, RasterOptions.near_plane)
     gaussians, camera = cast(scene, torch.float32)
     renderer = GaussianRenderer(backend=backend, alpha_threshold=0.0, transmittance_stop=0.0)
-    drawn = renderer(gaussians.to(device), move_camera(camera, device)).image.cpu()
+    drawn = renderer(gaussians.to(device), to(camera, device)).image.cpu()
     errors = relative_errors(gradients(drawn, gaussians), slopes)
     return max(float((drawn - image).detach().abs().max()), float(errors.max()))
 

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from kgs.backends import Backend, get_backend
+from kgs.geometry.types import RasterOptions
 from kgs.renderer import blend
 from kgs.stages import project, rasterize
-from kgs.types import RasterOptions
 
 from .arguments import as_kgs, check_words, refuse
 from .meta import Pairs
@@ -104,7 +104,7 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
         rasterize_mode: "classic", or "antialiased": see :class:`kgs.RasterOptions`.
         camera_model: "pinhole", "fisheye" (equidistant) or, up to degree 0, "ortho".
         covars: covariances in place of `quats` and `scales`, `(N, 3, 3)`: their upper triangles, see
-            :func:`kgs.covariance.covariance_factors`.
+            :func:`kgs.geometry.covariance.covariance_factors`.
         pixel_centers: "half" as in gsplat, or "integer": the first pixel's centre at (0, 0).
         backend: "auto", "torch", or in float32 "numba" (on a CPU) or "triton" (on a GPU), see `kgs.backends`.
 

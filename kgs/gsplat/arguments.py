@@ -5,14 +5,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from kornia.image import ImageSize
-from kornia.sensors.camera import CameraModel, CameraModelType
 from torch import Tensor
 
+from kgs._support.checks import check_tensor
 from kgs._support.errors import ArgumentError, quoted
-from kgs.camera import Cameras, PosedCamera, pinhole_cameras
-from kgs.covariance import covariance_factors
-from kgs.types import SH_SIZES, Gaussians, check_tensor
+from kgs.geometry.camera_models import camera_model
+from kgs.geometry.cameras import Cameras, PosedCamera, pinhole_cameras
+from kgs.geometry.covariance import covariance_factors
+from kgs.geometry.types import SH_SIZES, Gaussians
 
 _WORDS = {
     "render_mode": ("RGB", "D", "ED", "RGB+D", "RGB+ED"),
@@ -154,8 +154,7 @@ def _cameras(viewmats: Tensor, intrinsics: Tensor, size: tuple[int, int], lens: 
         return pinholes
     k = pinholes.intrinsics
     params = torch.stack([k[:, 0, 0], k[:, 1, 1], k[:, 0, 2], k[:, 1, 2]], 1)
-    kind = CameraModelType.ORTHOGRAPHIC
-    if lens == "fisheye":
-        kind = CameraModelType.KANNALA_BRANDT_K3
-        params = torch.nn.functional.pad(params, (0, 4))
-    return PosedCamera(CameraModel(ImageSize(height, width), kind, params), viewmats)
+    if lens == "ortho":
+        return PosedCamera(camera_model("orthographic", params, (height, width)), viewmats)
+    fisheye = torch.nn.functional.pad(params, (0, 4))
+    return PosedCamera(camera_model("kannala_brandt", fisheye, (height, width)), viewmats)

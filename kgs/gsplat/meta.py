@@ -6,8 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kgs.covariance import conics, reach, variances
-from kgs.types import ProjectedGaussians
+from kgs.geometry.covariance import conics, reach, variances
+from kgs.geometry.types import ProjectedGaussians
 
 _LARGEST_RADIUS = 2e9  # pixels, as an int32
 

@@ -31,9 +31,9 @@ from kornia.sensors.camera import CameraModelType
 import kgs
 import kgs.reference
 from kgs._support.errors import ArgumentError, DataError, PhotosRefused, cause_of, quoted
-from kgs.camera import image_size
 from kgs.compressed_ply import save_compressed_ply
 from kgs.densify import Densifier
+from kgs.geometry.cameras import image_size
 from kgs.losses import photometric_loss, target_moments
 from kgs.ply import load_ply, save_ply
 

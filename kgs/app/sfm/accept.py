@@ -20,7 +20,7 @@ import torch
 
 from kgs._support.errors import PhotosRefused
 from kgs._support.progress import ProgressBar
-from kgs.geometry import degrees_between
+from kgs.geometry.rigs import degrees_between
 
 from .find import MIN_PHOTOS
 from .map import Cameras, Solver

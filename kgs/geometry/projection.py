@@ -1,6 +1,6 @@
 """Parts of projection that the backends and outputs beside colours share.
 
-`kgs.backends.torch.projection` combines them. The footprint is in `kgs.covariance`, the lens in `kgs.camera`.
+`kgs.backends.torch.projection` combines them. The footprint is in `.covariance`, the lens in `.lenses`.
 """
 
 import torch
@@ -8,8 +8,9 @@ from torch import Tensor
 
 from kgs._support.errors import ArgumentError
 
-from .camera import Cameras, lenses, times
+from .cameras import Cameras
 from .covariance import rotation_matrices
+from .lenses import lenses, times
 from .types import Gaussians, ProjectedGaussians
 
 
@@ -68,7 +69,7 @@ def view_directions(means: Tensor, extrinsics: Tensor, parallel: bool = False) -
 
 
 def _inverse(matrix: Tensor) -> Tensor:
-    """The inverse of a 3x3 matrix by its cofactors; elementwise, as :func:`kgs.camera.times`."""
+    """The inverse of a 3x3 matrix by its cofactors; elementwise, as :func:`kgs.geometry.lenses.times`."""
     scale = matrix.detach().abs().amax()  # the products of small numbers would vanish
     x, y, z = (matrix / scale).unbind()
     cofactors = (torch.linalg.cross(y, z), torch.linalg.cross(z, x), torch.linalg.cross(x, y))
