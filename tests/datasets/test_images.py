@@ -121,13 +121,6 @@ def test_no_distortion_changes_nothing() -> None:
     assert pinhole == lens()
 
 
-def test_distortion_that_folds_the_image_is_refused() -> None:
-    with pytest.raises(ValueError, match="distortion: .*fold"):
-        undistort(blob(30.0, 30.0), lens(-3.0, 0.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match="distortion: .*fold"):
-        undistort(blob(30.0, 30.0), lens(40.0, 0.0, 0.0, 0.0))
-
-
 def test_sizes_that_can_be_scaled_versions() -> None:
     full = Intrinsics(4032, 3024, 3000.0, 3000.0, 2016.0, 1512.0)
     assert all(full.same_aspect(*size) for size in ((504, 378), (501, 376), (1008, 756), (4032, 3024), (253, 190)))
