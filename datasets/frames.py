@@ -1,5 +1,6 @@
 """What the files of a layout say about a scene: photos with lenses and poses, and how they are split."""
 
+import math
 import os
 import unicodedata
 from collections import defaultdict
@@ -18,7 +19,9 @@ from .image_file import ImageFile
 from .images import Intrinsics
 from .masks import Mask
 
-LARGEST = 1e15  # a scene's numbers, and the inverse of a focal length: squares of them are finite in float32
+LARGEST = 1e15  # a scene's numbers: squares of them are finite in float32
+SHORTEST_FOCAL = 0.1  # of the side: shorter ones are no pixels, but shares of the side
+_ROUNDED = 2e-3  # of the products of axes: what rounding to three digits leaves; `load_scene` makes them orthonormal
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,20 +44,18 @@ class Frame:
         wrong = partial(DataError, self.source, self.name)
         lens = self.intrinsics
         center = self.pose[:3, 3]
-        rotation = self.pose[:3, :3]
         numbers = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
         if not np.isfinite(numbers).all():
             raise wrong("finite intrinsics", "NaN or infinity")
-        if not (min(lens.fx, lens.fy) * LARGEST >= 1 and lens.width >= 1 and lens.height >= 1):
-            got = f"{lens.fx:g}, {lens.fy:g} and {lens.width}x{lens.height}"
-            raise wrong("a focal length and an image size above 0", got)
+        if not min(lens.width, lens.height) >= 1:
+            raise wrong("an image size above 0", f"{lens.width}x{lens.height}")
+        if not (lens.fx >= SHORTEST_FOCAL * lens.width and lens.fy >= SHORTEST_FOCAL * lens.height):
+            got = f"{lens.fx:g} and {lens.fy:g} for {lens.width}x{lens.height}"
+            raise wrong("focal lengths in pixels, at least a tenth of the sides", got)
         if self.pose.shape != (4, 4) or not bool(torch.isfinite(self.pose).all()):
             raise wrong("a finite 4x4 pose")
         if max(lens.width, lens.height, *map(abs, numbers), float(center.abs().max())) > LARGEST:
             raise wrong(f"intrinsics and a camera centre up to {LARGEST:g}")
-        error = float((rotation.mT @ rotation - torch.eye(3, dtype=torch.float64)).abs().max())
-        if not (error <= 1e-3 and float(torch.linalg.det(rotation)) > 0):  # the products may be NaN
-            raise wrong("a pose with a right-handed rotation", str(rotation.tolist()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +81,20 @@ class FrameSet:
     # the points of the scene's COLMAP model, if there is one, that at least two of the given frames see
     model_points: Callable[[Sequence[Frame]], PointCloud] | None = None
     notes: tuple[str, ...] = ()  # what the files say that is not used, one sentence each
+
+
+def check_rotation(source: Path, name: str, pose: Tensor) -> None:
+    """Raise a DataError unless a file's pose `(3+, 3+)`, in the axes of the file, has a right-handed rotation."""
+    axes = pose[:3, :3]
+    products = axes.mT @ axes
+    square = float(products.diagonal().mean())  # of the length of an axis
+    error = float((products / square - torch.eye(3, dtype=axes.dtype)).abs().max())
+    if not (error <= _ROUNDED and float(torch.linalg.det(axes)) > 0):  # the products may be NaN
+        raise DataError(source, name, "a right-handed rotation", str(axes.tolist()))
+    if abs(square - 1) > _ROUNDED:
+        raise DataError(
+            source, name, "a rotation", f"one scaled by {math.sqrt(square):.4g}", advice="divide it by that"
+        )
 
 
 def path_inside(source: Path, root: Path, name: str, folder: Path | None = None) -> Path:

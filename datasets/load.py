@@ -3,7 +3,6 @@
 import math
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from os import PathLike
@@ -15,7 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kgs._support.default_device import on_cpu
 from kgs._support.errors import ArgumentError, DataError, listed
+from kgs.geometry.cameras import pinhole_cameras
 
 from .border import with_border
 from .folders import CAMERAS_REPORT
@@ -25,7 +26,7 @@ from .images import rectification, remap, resize
 from .mask_files import find_mask_files
 from .masks import as_masks
 from .options import BACKGROUNDS, check_options
-from .scene import Scene, Views, pinholes
+from .scene import Scene, Views
 from .source import SceneSource
 from .splits import TEST_EVERY, select_evenly, split_between_ends, split_by_name
 
@@ -38,6 +39,8 @@ _CLOCKWISE = torch.tensor(
     device="cpu",
 )
 _VALID = 0.99  # share of a pixel that a mask keeps, above which it counts
+_ORIENTATION = 0x112  # a tag of Exif
+_SIDEWAYS = (5, 6, 7, 8)  # its values for photos that a quarter turn makes upright
 _FINE_PIXELS = 1_000_000  # of an image for the initial points: twice the width and height halves the error of depths
 
 
@@ -100,8 +103,7 @@ def load_scene(
     check_options(downscale, hold_out, background, points, mask_mode)
     source = SceneSource.of(path)
     root = source.root
-    # The context torch.device("cpu") slows torch down: it is entered only if the default device is another.
-    with nullcontext() if torch.get_default_device().type == "cpu" else torch.device("cpu"):
+    with on_cpu():
         frame_set = _with_masks(root, source.frames(photo_folder), None if masks is None else Path(masks))
         train, test = _split(root, frame_set, train_views, hold_out)
         cloud = frame_set.points
@@ -235,7 +237,11 @@ def _check_size(frame: Frame, width: int, height: int, scales: Sequence[_Scale])
     lens = frame.intrinsics
     if not lens.same_aspect(width, height):
         described = f"the {lens.width}x{lens.height} that {frame.source.name} describes"
-        raise DataError(frame.path, "", f"a scaled version of {described}", f"{width}x{height} pixels")
+        advice = ""
+        if lens.same_aspect(height, width) and frame.image.metadata.tags.get(_ORIENTATION) in _SIDEWAYS:
+            advice = "its Exif turns it by a quarter, and cameras have to be those of the photo as it is stored"
+        got = f"{width}x{height} pixels"
+        raise DataError(frame.path, "", f"a scaled version of {described}", got, advice=advice)
     for scale in scales:
         size = _reduced(width, height, scale.factor)
         if scale.size not in (size, size[::-1]):
@@ -320,7 +326,7 @@ def _views(
         mask = torch.stack([alphas[j].get(i, opaque) for i in range(count)]) if alphas[j] else None
         every = opaque[0] > 0
         rows = torch.stack([valid[j].get(i, every) for i in range(count)]) if valid[j] else None
-        cameras = pinholes(intrinsics[j], extrinsics, scale.size)
+        cameras = pinhole_cameras(extrinsics, intrinsics[j], *scale.size[::-1])
         kinds = tuple(turned) if any(turned) else None
         views.append(Views(cameras, images[j], names, mask, valid_mask=rows, turned=kinds))
     return views

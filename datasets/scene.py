@@ -13,11 +13,7 @@ from torch.nn.functional import avg_pool2d
 
 from kgs._support.errors import ArgumentError, DataError
 from kgs._support.shown import ShownByShapes
-
-
-def pinholes(intrinsics: Tensor, extrinsics: Tensor, size: tuple[int, int]) -> PinholeCamera:
-    """Cameras from `(V, 4, 4)` matrices and one (height, width) for all of them."""
-    return PinholeCamera(intrinsics, extrinsics, *(intrinsics.new_full((len(intrinsics),), float(s)) for s in size))
+from kgs.geometry.cameras import resized, select
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -117,19 +113,7 @@ class Views(ShownByShapes):
 
         TypeError for positions that are not integers, IndexError for views that do not exist.
         """
-        rows = index if isinstance(index, Tensor) else torch.as_tensor(index, device="cpu")
-        if rows.numel() and (rows.is_floating_point() or rows.is_complex() or rows.dtype == torch.bool):
-            raise TypeError(f"index: expected integers, got {rows.dtype}")
-        rows = rows.reshape(-1).long()
-        if not bool(((rows >= -len(self)) & (rows < len(self))).all()):
-            raise IndexError(
-                f"index: expected whole numbers below {len(self)}, the number of views, got {rows.tolist()}"
-            )
-        rows = rows.to(self.cameras.extrinsics.device)
-        cameras = self.cameras
-        return PinholeCamera(
-            cameras.intrinsics[rows], cameras.extrinsics[rows], cameras.height[rows], cameras.width[rows]
-        )
+        return select(self.cameras, index)
 
     def select(self, indices: Sequence[int]) -> Self:
         """The views at the given positions, in that order."""
@@ -196,12 +180,9 @@ class Views(ShownByShapes):
         if 0 in size:
             given = tuple(self.images.shape[-2:])
             raise ArgumentError("images", f"at least {factor} x {factor} pixels to downsample", given)
-        intrinsics = self.cameras.intrinsics.clone()
-        intrinsics[:, :2, :3] /= factor
-        intrinsics[:, :2, 2] += 0.5 / factor - 0.5  # (c + 1/2) / factor - 1/2: pixel centres are integers
         return replace(
             self,
-            cameras=pinholes(intrinsics, self.cameras.extrinsics, size),
+            cameras=resized(self.cameras, 1 / factor, size),
             images=avg_pool2d(self.images, factor),
             alphas=None if self.alphas is None else avg_pool2d(self.alphas, factor),
             border_mask=None if self.border_mask is None else avg_pool2d(self.border_mask[None], factor)[0],

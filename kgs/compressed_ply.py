@@ -2,9 +2,6 @@
 
 More viewers read this layout than SOG, the other compressed one: SuperSplat, PlayCanvas, Spark and Babylon.js read
 both, GaussianSplats3D only this one. Files of SOG take 0.68 to 0.86 of its bytes (docs/results/viewers).
-
-Source: PlayCanvas, "Compressing Gaussian Splats", 2024, https://blog.playcanvas.com/compressing-gaussian-splats; how
-codes become numbers again was compared in the readers of playcanvas 2.23.3 and GaussianSplats3D 0.4.7.
 """
 
 import os
@@ -16,23 +13,30 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kgs._support.checks import check_kind
 from kgs._support.errors import ArgumentError
 from kgs._support.json_files import write_whole
-from kgs.harmonics import SH_C0
+from kgs.geometry.harmonics import SH_C0
+from kgs.geometry.types import SH_SIZES
 from kgs.model import GaussianModel
+from kgs.packed_ply import (
+    BITS_OF_COLOR,
+    BITS_OF_ROTATION,
+    BITS_OF_VECTOR,
+    BOUNDS,
+    CHUNK,
+    PACKED,
+    ROTATION_RANGE,
+    SH_RANGE,
+    pack,
+)
 from kgs.ply import as_vector
-from kgs.types import SH_SIZES, check_kind
 
 __all__ = ["save_compressed_ply"]
 
-_CHUNK = 256  # Gaussians that share the ranges of their values
-_BITS_OF_VECTOR = (11, 10, 11)  # of x, y and z in a position, or of the three scales
 _FLATTEST = 16.0  # an axis of less than exp(-16) of the longest, 1e-7, is as thick as that
 _LOG_FLOATS = (-87.0, 88.0)  # logarithms of the smallest and the largest float32
-_SH_RANGE = 4.0  # harmonics of degree 1 and above are within -4 and 4
 _GOLDEN = 0.6180339887498949  # the fractions of its multiples are spread evenly over [0, 1)
-_RANGES = ("xyz", ("scale_x", "scale_y", "scale_z"), "rgb")  # properties of a chunk
-_BOUNDS = [f"{end}_{name}" for names in _RANGES for end in ("min", "max") for name in names]
 
 
 def save_compressed_ply(path: str | os.PathLike[str], model: GaussianModel, offset: Tensor | None = None) -> None:
@@ -71,16 +75,16 @@ def save_compressed_ply(path: str | os.PathLike[str], model: GaussianModel, offs
     _check_finite(values)
     order = _in_chunks(values["means"])
     values = {name: array[order] for name, array in values.items()}
-    low_means, high_means, means = _code_in_chunks(values["means"], _BITS_OF_VECTOR)
-    low_scales, high_scales, scales = _code_in_chunks(_finite_scales(values["log_scales"]), _BITS_OF_VECTOR)
+    low_means, high_means, means = _code_in_chunks(values["means"], BITS_OF_VECTOR)
+    low_scales, high_scales, scales = _code_in_chunks(_finite_scales(values["log_scales"]), BITS_OF_VECTOR)
     low_colors, high_colors, colors = _code_in_chunks(values["sh_dc"][:, 0] * SH_C0 + 0.5, (8, 8, 8))
     opacities = _code(torch.from_numpy(values["opacity_logits"]).sigmoid().numpy(), 0.0, 1.0, 8)
     chunks = np.hstack([low_means, high_means, low_scales, high_scales, low_colors, high_colors])
     rows = [
-        _pack(means, _BITS_OF_VECTOR),
+        pack(means, BITS_OF_VECTOR),
         _pack_rotations(values["quats"]),
-        _pack(scales, _BITS_OF_VECTOR),
-        _pack(np.column_stack([colors, opacities]), (8, 8, 8, 8)),
+        pack(scales, BITS_OF_VECTOR),
+        pack(np.column_stack([colors, opacities]), BITS_OF_COLOR),
     ]
     harmonics = _code_harmonics(values["sh_rest"][:, : SH_SIZES[model.sh_degree] - 1])
     lines = [
@@ -88,9 +92,9 @@ def save_compressed_ply(path: str | os.PathLike[str], model: GaussianModel, offs
         "format binary_little_endian 1.0",
         *(["comment SplatRenderMode: mip"] if model.antialiased else []),
         f"element chunk {len(chunks)}",
-        *(f"property float {name}" for name in _BOUNDS),
+        *(f"property float {name}" for name in BOUNDS),
         f"element vertex {len(model)}",
-        *(f"property uint packed_{name}" for name in ("position", "rotation", "scale", "color")),
+        *(f"property uint {name}" for name in PACKED),
     ]
     if harmonics.shape[1]:
         lines.append(f"element sh {len(model)}")
@@ -127,19 +131,19 @@ def _in_chunks(means: NDArray[np.float64]) -> NDArray[np.intp]:
 
     A split leaves each side at least an eighth of the chunks, which bounds the depth of the tree.
     """
-    steps = means / (2.0 ** np.array(_BITS_OF_VECTOR) - 1.0)  # in these units, codes of all three axes are as coarse
+    steps = means / (2.0 ** np.array(BITS_OF_VECTOR) - 1.0)  # in these units, codes of all three axes are as coarse
     waiting = [np.arange(len(means))]
     done = []
     while waiting:
         rows = waiting.pop()
-        chunks = -(-len(rows) // _CHUNK)
+        chunks = -(-len(rows) // CHUNK)
         if chunks == 1:
             done.append(rows)
             continue
         axis = np.ptp(steps[rows], axis=0).argmax()
         rows = rows[np.argsort(steps[rows, axis], kind="stable")]
         minimum = max(1, chunks // 8)
-        cuts = np.arange(minimum, chunks - minimum + 1) * _CHUNK
+        cuts = np.arange(minimum, chunks - minimum + 1) * CHUNK
         before = _sizes_of_boxes(steps[rows])[cuts - 1]
         behind = _sizes_of_boxes(steps[rows[::-1]])[len(rows) - cuts - 1]
         cut = cuts[(before * cuts + behind * (len(rows) - cuts)).argmin()]
@@ -158,10 +162,10 @@ def _code_in_chunks(
     array: NDArray[np.float64], bits: tuple[int, ...]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.uint32]]:
     """The smallest and largest values of each chunk, `(chunks, 3)`, as float32 has them; codes within, `(N, 3)`."""
-    starts = np.arange(0, len(array), _CHUNK)
+    starts = np.arange(0, len(array), CHUNK)
     low = np.minimum.reduceat(array, starts).astype(np.float32).astype(np.float64)
     high = np.maximum.reduceat(array, starts).astype(np.float32).astype(np.float64)
-    chunks = np.arange(len(array)) // _CHUNK
+    chunks = np.arange(len(array)) // CHUNK
     codes = [_code(array[:, k], low[chunks, k], high[chunks, k], bits[k]) for k in range(3)]
     return low, high, np.column_stack(codes)
 
@@ -174,14 +178,6 @@ def _code(values: NDArray[np.float64], low: Any, high: Any, bits: int) -> NDArra
     return codes
 
 
-def _pack(codes: NDArray[np.uint32], bits: tuple[int, ...]) -> NDArray[np.uint32]:
-    """One integer for each row of codes, the first of them in its highest bits, `(N,)`."""
-    packed = np.zeros(len(codes), np.uint32)
-    for k, count in enumerate(bits):
-        packed = (packed << np.uint32(count)) | codes[:, k]
-    return packed
-
-
 def _pack_rotations(quats: NDArray[np.float64]) -> NDArray[np.uint32]:
     """Rotations w, x, y, z of any norm as the index of the largest component and the other three, `(N,)`."""
     rows = np.arange(len(quats))
@@ -190,8 +186,8 @@ def _pack_rotations(quats: NDArray[np.float64]) -> NDArray[np.uint32]:
     turned = np.copysign(np.where(norms > 0, norms, 1.0), quats[rows, largest])  # the largest component is positive
     others = (np.arange(3) + (np.arange(3) >= largest[:, None])).astype(np.intp)
     kept = np.take_along_axis(quats / turned[:, None], others, axis=1)
-    codes = _code(kept, -np.sqrt(0.5), np.sqrt(0.5), 10)
-    return _pack(np.column_stack([largest.astype(np.uint32), codes]), (2, 10, 10, 10))
+    codes = _code(kept, -ROTATION_RANGE, ROTATION_RANGE, 10)
+    return pack(np.column_stack([largest.astype(np.uint32), codes]), BITS_OF_ROTATION)
 
 
 def _code_harmonics(sh_rest: NDArray[np.float64]) -> NDArray[np.uint8]:
@@ -204,7 +200,7 @@ def _code_harmonics(sh_rest: NDArray[np.float64]) -> NDArray[np.uint8]:
     used = np.flatnonzero(sh_rest.any(axis=(0, 2)))
     bands = next(size - 1 for size in SH_SIZES if size - 1 > (used[-1] if len(used) else -1))
     rows = sh_rest[:, :bands].transpose(0, 2, 1).reshape(len(sh_rest), 3 * bands)
-    exact = (np.clip(rows / _SH_RANGE, -1.0, 1.0) + 1.0) / 2.0 * 255.0
+    exact = (np.clip(rows / SH_RANGE, -1.0, 1.0) + 1.0) / 2.0 * 255.0
     phases = np.arange(3 * bands) * _GOLDEN % 1.0
     codes = np.diff(np.floor(np.cumsum(exact, axis=0) + phases), axis=0, prepend=0.0)
     return np.clip(codes, 0.0, 255.0).astype(np.uint8)  # a rounding error of the sum may add one

@@ -13,12 +13,13 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.graph import increment_version
 
+from kgs._support.checks import check_kind
 from kgs._support.errors import ArgumentError
 
 from .backends import Backend, get_backend
-from .covariance import rotation_matrices
+from .geometry.covariance import rotation_matrices
+from .geometry.types import ProjectedGaussians
 from .model import GaussianModel
-from .types import ProjectedGaussians, check_kind
 
 CHILDREN = 2
 SHRINK = 1.6  # a child's scale is its parent's divided by 0.8 times the number of children

@@ -13,12 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from kgs._support.checks import check_tensor
 from kgs._support.errors import ArgumentError, quoted
 
 from .backends import Backend, get_backend
-from .geometry import log_spacing
-from .harmonics import SH_C0
-from .types import SH_SIZES, Gaussians, check_tensor
+from .geometry.harmonics import SH_C0
+from .geometry.spacing import log_spacing
+from .geometry.types import SH_SIZES, Gaussians
 
 INITIAL_OPACITY = 0.1
 PARAMETERS = ("means", "quats", "log_scales", "opacity_logits", "sh_dc", "sh_rest")
@@ -72,8 +73,7 @@ class GaussianModel(nn.Module):
         values = dict(zip(PARAMETERS, (means, quats, log_scales, opacity_logits, sh_dc, sh_rest), strict=True))
         for name, value in values.items():
             check_tensor(name, value)
-            if value.dtype not in (torch.float32, torch.float64):
-                raise TypeError(f"{name}: expected float32 or float64, got {value.dtype}")
+            _check_dtype(name, value)
             check_tensor(name, value, means, " as means")
         highest = _check_shapes(list(values.values()))
         self.means = nn.Parameter(means.detach().clone())
@@ -105,8 +105,7 @@ class GaussianModel(nn.Module):
         """
         check_tensor("points", points)
         check_tensor("colors", colors)
-        if points.dtype not in (torch.float32, torch.float64):
-            raise TypeError(f"points: expected float32 or float64, got {points.dtype}")
+        _check_dtype("points", points)
         if not colors.is_floating_point():
             raise TypeError(f"colors: expected floating point values, got {colors.dtype}")
         if points.ndim != 2 or points.shape[1] != 3 or colors.shape != points.shape:
@@ -134,8 +133,11 @@ class GaussianModel(nn.Module):
     def select(self, rows: Tensor, sh_degree: int | None = None) -> "GaussianModel":
         """A new model of the Gaussians at `rows`: a mask `(N,)` or indices `(M,)`.
 
-        `sh_degree` is the highest degree of the harmonics that are kept; None keeps all.
+        `sh_degree` is the highest degree of the harmonics that are kept; None keeps all. A ValueError for a mask of
+        another length.
         """
+        if rows.dtype == torch.bool and rows.shape != (len(self),):
+            raise ArgumentError("rows", f"a mask of shape ({len(self)},)", tuple(rows.shape))
         degree = self.max_sh_degree if sh_degree is None else _check_degree(sh_degree, self.max_sh_degree)
         values = {name: parameter.detach()[rows] for name, parameter in self.per_gaussian().items()}
         values["sh_rest"] = values["sh_rest"][:, : SH_SIZES[degree] - 1]
@@ -207,6 +209,11 @@ class GaussianModel(nn.Module):
         antialiased = ", antialiased" if self.antialiased else ""
         degrees = f"sh_degree={self.sh_degree} of {self.max_sh_degree}"
         return f"{len(self)} Gaussians, {degrees}, {self.means.dtype}{antialiased}"
+
+
+def _check_dtype(name: str, value: Tensor) -> None:
+    if value.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"{name}: expected float32 or float64, got {value.dtype}")
 
 
 def _check_degree(value: int, highest: int) -> int:

@@ -17,10 +17,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kgs import packed_ply
+from kgs._support.checks import check_kind
 from kgs._support.errors import ArgumentError, DataError, quoted, warn
 from kgs._support.json_files import write_whole
+from kgs.geometry.types import SH_SIZES
 from kgs.model import MAX_SH_DEGREE, GaussianModel
-from kgs.types import SH_SIZES, check_kind
 
 MAX_HEADER = 1 << 16  # bytes
 # NumPy's codes for the formats and types of PLY files.
@@ -31,6 +33,7 @@ SCALARS = {
     **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
 }
 _REST_COUNTS = [3 * (size - 1) for size in SH_SIZES]  # properties f_rest, by degree
+_PLAIN_COUNT = 14  # properties of a splat that are none of these
 
 
 class Float32Warning(UserWarning):
@@ -105,6 +108,8 @@ def save_ply(
 def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> GaussianModel:
     """Read a 3DGS PLY file: ascii or binary, properties in any order and of any scalar type, harmonics of degree 0-3.
 
+    Compressed files are read too, see :func:`kgs.save_compressed_ply`.
+
     Other properties and elements are skipped. The active degree is that of a comment of kgs, else that of the harmonics
     in the file. The model is antialiased if a comment says so: `SplatRenderMode: mip` (Brush, splat-transform, kgs) or
     `antialiased 1` (Postshot). Scales of -inf, those of flat discs, and opacities of inf and -inf, which are 1 and 0,
@@ -129,13 +134,14 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
     try:
         with open(path, "rb") as file:
             header = _read_header(path, file)
-            vertex = header.elements[_find_vertex(path, header)]
-            rest = _count_harmonics(path, vertex)
-            names = [*"xyz", *_properties_after_normals(rest)]
-            for name in names:
-                if name not in vertex.codes:
-                    raise DataError(path, name, "this property of a splat", "none")
-            columns = _read_columns(path, header, file)
+            vertex = _find(path, header, "vertex")
+            if packed_ply.PACKED[0] in vertex.codes:
+                columns = _read_packed(path, header, file)
+                rest = len(columns) - _PLAIN_COUNT
+            else:
+                rest = _count_harmonics(path, vertex)
+                _check_properties(path, vertex, [*"xyz", *_properties_after_normals(rest)])
+                columns = _read_columns(path, header, file, vertex)
     except OSError as error:
         if path.is_dir():
             meant = f"its splat is {path / 'splat.ply'}" if (path / "splat.ply").is_file() else ""
@@ -143,6 +149,7 @@ def load_ply(path: str | os.PathLike[str], origin: Tensor | None = None) -> Gaus
         raise DataError(path, "", "a file that can be read", advice=error.strerror or str(error)) from error
     except MemoryError as error:
         raise DataError(path, "vertex", "as many as fit into memory", vertex.count) from error
+    names = [*"xyz", *_properties_after_normals(rest)]
     means = np.stack([columns[name].astype(np.float64) for name in "xyz"], axis=1) - shift
     with np.errstate(over="ignore"):
         others = (columns[name].astype(np.float32) for name in names[3:])
@@ -273,23 +280,50 @@ def _properties_after_normals(rest: int) -> list[str]:
     return [*colors, "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
 
 
-def _find_vertex(path: Path, header: _Header) -> int:
-    """The index of the element "vertex"."""
-    indices = [i for i, element in enumerate(header.elements) if element.name == "vertex"]
-    if len(indices) != 1:
-        raise DataError(path, "vertex", "one element of that name", len(indices))
-    return indices[0]
+def _find(path: Path, header: _Header, name: str) -> _Element:
+    """The one element of this name."""
+    found = [element for element in header.elements if element.name == name]
+    if len(found) != 1:
+        raise DataError(path, name, "one element of that name", len(found))
+    return found[0]
 
 
-def _count_harmonics(path: Path, vertex: _Element) -> int:
+def _count_harmonics(path: Path, element: _Element) -> int:
     """The number of properties f_rest."""
-    if "packed_position" in vertex.codes:
-        advice = "take the PLY that it was made from"
-        raise DataError(path, "", "a plain splat", "a compressed one, which kgs cannot read", advice=advice)
-    count = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in vertex.codes)
+    count = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in element.codes)
     if count not in _REST_COUNTS:
         raise DataError(path, "f_rest", f"{_REST_COUNTS} properties of that name", count)
     return count
+
+
+def _check_properties(path: Path, element: _Element, names: list[str]) -> None:
+    """Raise a DataError where an element lacks a property."""
+    for name in names:
+        if name not in element.codes:
+            raise DataError(path, name, "this property of a splat", "none")
+
+
+def _read_packed(path: Path, header: _Header, file: BinaryIO) -> dict[str, NDArray[np.generic]]:
+    """The properties of a compressed splat, as a plain one has them."""
+    vertex = _find(path, header, "vertex")
+    chunk = _find(path, header, "chunk")
+    _check_properties(path, vertex, packed_ply.PACKED)
+    _check_properties(path, chunk, packed_ply.BOUNDS)
+    expected = -(-vertex.count // packed_ply.CHUNK)
+    if chunk.count != expected:
+        raise DataError(path, "chunk", f"{expected} for {vertex.count} Gaussians", chunk.count)
+    harmonics: dict[str, NDArray[np.generic]] = {}
+    start = file.tell()
+    if any(element.name == "sh" for element in header.elements):
+        sh = _find(path, header, "sh")
+        _check_properties(path, sh, [f"f_rest_{i}" for i in range(_count_harmonics(path, sh))])
+        if sh.count != vertex.count:
+            raise DataError(path, "sh", f"{vertex.count} as vertices", sh.count)
+        harmonics = _read_columns(path, header, file, sh)
+        file.seek(start)
+    ranges = _read_columns(path, header, file, chunk)
+    file.seek(start)
+    return packed_ply.unpacked(ranges, _read_columns(path, header, file, vertex), harmonics)
 
 
 def _read_header(path: Path, file: BinaryIO) -> _Header:
@@ -325,20 +359,19 @@ def _read_header(path: Path, file: BinaryIO) -> _Header:
     return header
 
 
-def _read_columns(path: Path, header: _Header, file: BinaryIO) -> dict[str, NDArray[np.generic]]:
-    """The properties of the vertices by name, `(N,)` each.
+def _read_columns(path: Path, header: _Header, file: BinaryIO, element: _Element) -> dict[str, NDArray[np.generic]]:
+    """The properties of an element by name, `(N,)` each; the file is at the first byte of the data.
 
     Binary data are read only if the file has as many bytes as the header says, so a wrong count takes no memory.
     """
-    index = _find_vertex(path, header)
-    vertex = header.elements[index]
-    dtypes = [_row_dtype(element, BYTE_ORDERS[header.format]) for element in header.elements]
+    index = header.elements.index(element)
+    dtypes = [_row_dtype(each, BYTE_ORDERS[header.format]) for each in header.elements]
     if any(dtype.hasobject for dtype in dtypes[: index + 1]):
-        raise DataError(path, "vertex", "no list property in it or before it", "one")
+        raise DataError(path, element.name, "no list property in it or before it", "one")
     is_text = header.format == "ascii"
     data_start = file.tell()
     widths = [len(dtype.names or ()) if is_text else dtype.itemsize for dtype in dtypes]
-    sizes = [element.count * width for element, width in zip(header.elements, widths, strict=True)]
+    sizes = [each.count * width for each, width in zip(header.elements, widths, strict=True)]
     start = sum(sizes[:index])
     end = start + sizes[index]
     total = sum(sizes)
@@ -350,13 +383,13 @@ def _read_columns(path: Path, header: _Header, file: BinaryIO) -> dict[str, NDAr
     has_lists = any(dtype.hasobject for dtype in dtypes)  # behind the vertices: then the total is not known
     if available < end or (available != total and not has_lists):
         unit = "numbers" if is_text else "bytes"
-        raise DataError(path, "vertex", f"{total} {unit} after the header", available)
+        raise DataError(path, element.name, f"{total} {unit} after the header", available)
     if is_text:
-        table = numbers[start:end].reshape(vertex.count, widths[index])
-        return dict(zip(vertex.codes, table.T, strict=True))
+        table = numbers[start:end].reshape(element.count, widths[index])
+        return dict(zip(element.codes, table.T, strict=True))
     file.seek(data_start + start)
-    rows = np.fromfile(file, dtypes[index], vertex.count)
-    return {name: rows[name] for name in vertex.codes}
+    rows = np.fromfile(file, dtypes[index], element.count)
+    return {name: rows[name] for name in element.codes}
 
 
 def _row_dtype(element: _Element, byte_order: str) -> np.dtype[Any]:

@@ -14,7 +14,10 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from .types import Gaussians, RasterOptions, check_intrinsics, check_kind, check_tensor
+from kgs._support.checks import check_intrinsics, check_kind, check_tensor
+from kgs._support.default_device import cpu_by_default
+
+from .geometry.types import Gaussians, RasterOptions
 
 __all__ = ["Layers", "layers", "render"]
 
@@ -84,6 +87,7 @@ def render(
     return image[None]
 
 
+@cpu_by_default
 def layers(
     gaussians: Gaussians,
     camera: PinholeCamera,

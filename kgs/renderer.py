@@ -8,13 +8,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from kgs._support.checks import check_kind, check_tensor
 from kgs._support.errors import ArgumentError, quoted
 
 from .backends import Backend, check_backend, get_backend
-from .camera import Cameras
-from .projection import normals
+from .geometry.cameras import Cameras
+from .geometry.projection import normals
+from .geometry.types import Gaussians, RasterOptions, Rendering, raster_options
 from .stages import outside_graphs, project, rasterize
-from .types import Gaussians, RasterOptions, Rendering, check_kind, check_tensor, raster_options
 
 _OUTPUTS = ("image", "alpha", "depth", "median_depth", "normal")
 

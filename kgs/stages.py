@@ -12,21 +12,14 @@ import torch
 from torch import Tensor
 
 from kgs._support.autograd import refuse_second_derivative
+from kgs._support.checks import check_kind, check_tensor
 from kgs._support.errors import ArgumentError
 
 from .backends import Backend, get_backend
 from .backends.signatures import Compositor, Images
-from .camera import Cameras, image_size, intrinsics, with_constant_last_rows
-from .covariance import compensations, reach, variances
-from .types import (
-    Composited,
-    Gaussians,
-    ProjectedGaussians,
-    RasterOptions,
-    check_kind,
-    check_tensor,
-    raster_options,
-)
+from .geometry.cameras import Cameras, image_size, intrinsics, with_constant_last_rows
+from .geometry.covariance import compensations, reach, variances
+from .geometry.types import Composited, Gaussians, ProjectedGaussians, RasterOptions, raster_options
 
 F = TypeVar("F", bound=Callable[..., Any])
 

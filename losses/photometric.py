@@ -36,7 +36,7 @@ C2 = 0.03**2
 EPS = 1e-12
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TargetMoments:
     """Local mean and variance of a target, as the SSIM needs them; images and channels share one axis.
 

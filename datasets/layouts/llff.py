@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kgs._support.errors import DataError
 from kgs.datasets.folders import find_models, image_folder, list_images
-from kgs.datasets.frames import Frame, FrameSet, PointCloud, path_inside
+from kgs.datasets.frames import Frame, FrameSet, PointCloud, check_rotation, path_inside
 from kgs.datasets.image_file import ImageFile
 from kgs.datasets.images import Intrinsics
 
@@ -60,7 +60,9 @@ def _read_rows(path: Path) -> NDArray[np.float64]:
 
 
 def _frame(source: Path, path: Path, row: NDArray[np.float64]) -> Frame:
-    down, right, backward, center, (height, width, focal) = row[:15].reshape(3, 5).T
+    matrix = row[:15].reshape(3, 5)
+    check_rotation(source, path.name, torch.from_numpy(matrix))
+    down, right, backward, center, (height, width, focal) = matrix.T
     pose = np.vstack([np.stack([right, down, -backward, center], axis=1), [0.0, 0.0, 0.0, 1.0]])
     lens = Intrinsics(int(width), int(height), focal, focal, width / 2, height / 2)
     return Frame(source, path.name, ImageFile(path), lens, torch.from_numpy(pose))

@@ -17,7 +17,7 @@ from torch import Tensor
 from kgs._support.errors import DataError, quantity, quoted
 from kgs._support.json_files import is_number, read_json
 from kgs.datasets.folders import IMAGE_SUFFIXES
-from kgs.datasets.frames import Frame, FrameSet, find_file, path_inside
+from kgs.datasets.frames import Frame, FrameSet, check_rotation, find_file, path_inside
 from kgs.datasets.image_file import ImageFile
 from kgs.datasets.images import Intrinsics
 from kgs.datasets.masks import Mask
@@ -269,4 +269,5 @@ def _opencv_pose(path: Path, frame: Object) -> Tensor:
     if float((matrix[0, 3] - last).abs().max()) > 1e-6:  # an inverse is off by rounding
         raise DataError(path, name, "the last row 0, 0, 0, 1", matrix[0, 3].tolist())
     matrix[0, 3] = last
+    check_rotation(path, name, matrix[0])
     return kg.camtoworld_graphics_to_vision_4x4(matrix)[0]

@@ -15,8 +15,10 @@ from kornia.geometry.camera import PinholeCamera
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kgs._support.default_device import on_cpu
 from kgs._support.errors import ArgumentError
-from kgs.datasets.scene import Scene, Views, pinholes
+from kgs.datasets.scene import Scene, Views
+from kgs.geometry.cameras import image_size, pinhole_cameras, resized, select, to
 
 from . import room
 from .raycast import Array, raycast
@@ -54,7 +56,7 @@ def synthetic_scene(
             raise ArgumentError(name, f"at least {minimum}", value)
     world = _make_world(seed)
     train_eyes, test_eyes = _patch_eyes(train_views, test_views, np.random.default_rng([seed, 1]))
-    with torch.device("cpu"):  # whatever torch's default is
+    with on_cpu():
         train = _views(world, train_eyes, size, "train")
         test = _views(world, test_eyes, size, "test")
         no_points = torch.zeros(0, 3, dtype=torch.float32)
@@ -98,10 +100,7 @@ def synthetic_depths(cameras: PinholeCamera, seed: int = 0) -> Tensor:
     Raises:
         ValueError: the cameras differ in image size.
     """
-    sizes = set(zip(cameras.height.int().tolist(), cameras.width.int().tolist(), strict=True))
-    if len(sizes) != 1:
-        raise ArgumentError("cameras", "one image size", sorted(sizes))
-    size = sizes.pop()
+    size = image_size(cameras)
     triangles = _make_world(seed).triangles
     matrices = zip(cameras.intrinsics.double().cpu(), cameras.extrinsics.double().cpu(), strict=True)
     depths = [raycast(triangles, k.numpy(), e.numpy(), size)[0] for k, e in matrices]
@@ -115,34 +114,32 @@ def _views(world: World, eyes: Array, size: tuple[int, int], split: str) -> View
     """Images of a world from some positions `(V, 3)`; all cameras are upright and look at the middle of the scene."""
     (height, width) = size
     count = len(eyes)
-    intrinsics = torch.eye(4, dtype=torch.float32).repeat(count, 1, 1)
-    intrinsics[:, 0, 0] = intrinsics[:, 1, 1] = room.FOCAL * max(size)
-    intrinsics[:, 0, 2] = (width - 1) / 2
-    intrinsics[:, 1, 2] = (height - 1) / 2
+    focal = room.FOCAL * max(size)
+    matrix = [[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]]
     extrinsics = torch.zeros(count, 4, 4, dtype=torch.float32)
     for i, eye in enumerate(eyes):
         # poses are rounded to float32 before rendering, so that the images are exactly those of the cameras
         extrinsics[i] = torch.from_numpy(_look_at(eye, room.CENTER))
+    cameras = pinhole_cameras(extrinsics, torch.tensor(matrix, dtype=torch.float32), width, height)
     world.prepare()
     images = np.zeros((count, 3, height, width), dtype=np.float32)
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        cameras = intrinsics.double().numpy(), extrinsics.double().numpy()
-        drawn = pool.map(lambda matrix, pose: _render(world, matrix, pose, size), *cameras)
-        for i, image in enumerate(drawn):
+        for i, image in enumerate(pool.map(lambda i: _render(world, select(cameras, i), size), range(count))):
             images[i] = image
     names = tuple(f"{split}_{i:02d}" for i in range(count))
-    return Views(pinholes(intrinsics, extrinsics, size), torch.from_numpy(images), names)
+    return Views(cameras, torch.from_numpy(images), names)
 
 
-def _render(world: World, intrinsics: Array, extrinsics: Array, size: tuple[int, int]) -> NDArray[np.float32]:
+def _render(world: World, camera: PinholeCamera, size: tuple[int, int]) -> NDArray[np.float32]:
     """The image `(3, H, W)`: the mean over rays spread evenly over the square of each pixel."""
     s = SUPERSAMPLING
-    fine = intrinsics[:3, :3].copy()
-    fine[:2] *= s
-    fine[:2, 2] += (s - 1) / 2  # the middle of s fine pixels is the centre of the coarse one
-    depths, faces = raycast(world.triangles, fine, extrinsics, (size[0] * s, size[1] * s))
+    fine_size = (size[0] * s, size[1] * s)
+    fine = resized(to(camera, dtype=torch.float64), s, fine_size)
+    matrix = fine.intrinsics[0, :3, :3].numpy()
+    extrinsics = fine.extrinsics[0].numpy()
+    depths, faces = raycast(world.triangles, matrix, extrinsics, fine_size)
     v, u = np.nonzero(faces >= 0)
-    rays = np.stack([u, v, np.ones_like(u)], axis=-1).astype(np.float64) @ np.linalg.inv(fine).T
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1).astype(np.float64) @ np.linalg.inv(matrix).T
     points = (rays * depths[v, u, None] - extrinsics[:3, 3]) @ extrinsics[:3, :3]
     colors = np.zeros((*faces.shape, 3), dtype=np.float32)
     colors[v, u] = world.shade(points, faces[v, u])

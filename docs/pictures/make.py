@@ -37,46 +37,53 @@ def of_layer(splat: kgs.GaussianModel, gaussians: kgs.Gaussians, viewmats: Tenso
     """All Gaussians; one mask of the layer at each of two rates; the mean of many at the first rate."""
 
     def dropped(drop: kgs.DropGaussian) -> Tensor:
-        return render(splat, gaussians, viewmats, opacities=drop(gaussians.opacities))[0]
+        return render(splat, gaussians, viewmats, opacities=drop(gaussians.opacities))
 
     low, high = (kgs.DropGaussian(rate, "constant", seed=0) for rate in RATES)
-    whole = render(splat, gaussians, viewmats)[0]
+    whole = render(splat, gaussians, viewmats)
     mean = torch.stack([dropped(low) for _ in range(MASKS)]).mean(0)
     save("layer.jpg", [whole, dropped(low), dropped(high), mean])
 
 
 def of_outputs(splat: kgs.GaussianModel, gaussians: kgs.Gaussians, viewmats: Tensor) -> None:
-    """Colour, expected depth and normals of one call."""
-    colors, alphas, meta = render(splat, gaussians, viewmats, render_mode="RGB+ED", return_normals=True)
-    depth = colors[..., 3]
-    near, far = depth[alphas[..., 0] > 0.5].quantile(torch.tensor([0.02, 0.98]))
+    """Colour, expected depth and normals of one camera."""
+    cameras = kgs.pinhole_cameras(viewmats, lens(0.9), WIDTH, HEIGHT, "half")
+    out = kgs.GaussianRenderer()(gaussians, cameras, outputs=("image", "alpha", "depth", "normal"))
+    depth = out.depth[0, 0]
+    near, far = depth[out.alpha[0, 0] > 0.5].quantile(torch.tensor([0.02, 0.98]))
     scaled = (255 * ((far - depth) / (far - near)).clamp(0, 1)).byte().numpy()
     colored = torch.from_numpy(cv2.applyColorMap(scaled, cv2.COLORMAP_VIRIDIS)[..., ::-1].copy()) / 255
-    normals = (1 - normalize(meta["normals"][0], dim=-1)) / 2
-    save("outputs.jpg", [colors[..., :3], colored, normals])
+    normals = (1 - normalize(out.normal[0], dim=0).permute(1, 2, 0)) / 2
+    save("outputs.jpg", [out.image[0].permute(1, 2, 0), colored, normals])
 
 
 def of_lenses(splat: kgs.GaussianModel, gaussians: kgs.Gaussians, viewmats: Tensor) -> None:
-    """The same camera with three lenses."""
+    """The same camera with three lenses; harmonics of degree 0, which all have."""
     images = [
-        render(splat, gaussians, viewmats, focal=focal, camera_model=model)[0]
+        render(splat, gaussians, viewmats, focal=focal, camera_model=model, sh_degree=0)
         for model, focal in (("pinhole", 0.9), ("fisheye", 0.9), ("ortho", 0.45))
     ]
     save("lenses.jpg", images)
 
 
+def lens(focal: float) -> Tensor:
+    """Intrinsics of a focal length in widths, the first pixel's centre at (0.5, 0.5)."""
+    length = focal * WIDTH
+    return torch.tensor([[[length, 0.0, WIDTH / 2], [0.0, length, HEIGHT / 2], [0.0, 0.0, 1.0]]])
+
+
 def render(
     splat: kgs.GaussianModel, gaussians: kgs.Gaussians, viewmats: Tensor, focal: float = 0.9, **options
-) -> tuple[Tensor, ...]:
-    """Colours `(H, W, D)`, alphas `(H, W, 1)` and what else there is, by `kgs.rasterization`; focal in widths."""
-    length = focal * WIDTH
-    intrinsics = torch.tensor([[[length, 0.0, WIDTH / 2], [0.0, length, HEIGHT / 2], [0.0, 0.0, 1.0]]])
-    opacities = options.pop("opacities", gaussians.opacities)
-    values = gaussians.means, gaussians.quats, gaussians.scales, opacities, gaussians.colors
-    colors, alphas, meta = kgs.rasterization(
-        *values, viewmats, intrinsics, WIDTH, HEIGHT, sh_degree=splat.sh_degree, **options
-    )
-    return colors[0], alphas[0], meta
+) -> Tensor:
+    """The image `(H, W, 3)` by `kgs.rasterization`; focal in widths."""
+    options = {"opacities": gaussians.opacities, "sh_degree": splat.sh_degree} | options
+    values = {
+        "means": gaussians.means,
+        "quats": gaussians.quats,
+        "scales": gaussians.scales,
+        "colors": gaussians.colors,
+    }
+    return kgs.rasterization(**values, viewmats=viewmats, Ks=lens(focal), width=WIDTH, height=HEIGHT, **options)[0][0]
 
 
 def save(name: str, images: list[Tensor]) -> None:

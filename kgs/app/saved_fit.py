@@ -20,8 +20,8 @@ from kgs.fit.exposure import with_exposure
 from kgs.fit.fit import Fit
 from kgs.fit.poses import with_extrinsics
 from kgs.fit.state import check_plain, state_errors
+from kgs.geometry.types import RasterOptions
 from kgs.model import GaussianModel
-from kgs.types import RasterOptions
 
 from .scene_request import SceneRequest
 

@@ -7,8 +7,8 @@ from kornia.filters import gaussian_blur2d, get_gaussian_kernel1d
 from kornia.losses import ssim_loss
 from torch import Tensor
 
-from kgs.camera import image_size, pinhole_cameras
-from kgs.types import Gaussians, RasterOptions
+from kgs.geometry.cameras import image_size, pinhole_cameras
+from kgs.geometry.types import Gaussians, RasterOptions
 
 from .signatures import AdamUpdate
 from .table import TORCH, Backend

@@ -8,8 +8,8 @@ from typing import NamedTuple, Protocol
 
 from torch import Tensor
 
-from kgs.camera import Cameras
-from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
+from kgs.geometry.cameras import Cameras
+from kgs.geometry.types import Gaussians, ProjectedGaussians, RasterOptions
 
 
 class Activate(Protocol):

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from kgs._support.errors import ArgumentError
-from kgs.types import ProjectedGaussians, RasterOptions
+from kgs.geometry.types import ProjectedGaussians, RasterOptions
 
 from .signatures import (
     Activate,

@@ -10,9 +10,9 @@ from kgs._support.extras import installing
 from kgs._support.machine import check_device, versions
 from kgs.backends import BACKENDS, Backend, get_backend
 from kgs.backends.self_check import BOUND, largest_error
-from kgs.camera import move_camera
+from kgs.geometry.cameras import to
+from kgs.geometry.types import RasterOptions
 from kgs.renderer import GaussianRenderer
-from kgs.types import RasterOptions
 
 from .scenes import cast, exact, gradients, layered_scene, relative_errors
 from .speed import SIZE, Cases
@@ -107,7 +107,7 @@ def _off_by(backend: Backend, device: torch.device) -> float:
     image, slopes = exact(scene, RasterOptions.near_plane)
     gaussians, camera = cast(scene, torch.float32)
     renderer = GaussianRenderer(backend=backend.name, alpha_threshold=0.0, transmittance_stop=0.0)
-    drawn = renderer(gaussians.to(device), move_camera(camera, device)).image.cpu()
+    drawn = renderer(gaussians.to(device), to(camera, device)).image.cpu()
     of_image = (drawn - image).detach().abs().max()
     of_gradients = relative_errors(gradients(drawn, gaussians), slopes).max()
     of_stages = 0.0 if backend.name == "torch" else largest_error(backend, device)

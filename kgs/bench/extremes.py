@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from kgs.camera import move_camera
+from kgs.geometry.cameras import to
+from kgs.geometry.types import Gaussians
 from kgs.renderer import GaussianRenderer
-from kgs.types import Gaussians
 
 from .output import Row, markdown_table, write_results
 from .scenes import DTYPES, Scene, cast, centred_camera, exact, gradients, relative_errors
@@ -71,7 +71,7 @@ def errors(case: Row, dtype: str, device: torch.device = CPU) -> Row:
     cloud, view = SCENES[case["case"]]()
     near_plane = case["near_plane"]
     expected, expected_gradients = exact(cast((cloud, view), DTYPES[dtype]), near_plane)
-    image, slopes = render((cloud.to(device), move_camera(view, device)), DTYPES[dtype], near_plane=near_plane)
+    image, slopes = render((cloud.to(device), to(view, device)), DTYPES[dtype], near_plane=near_plane)
     slopes = {name: gradient.cpu() for name, gradient in slopes.items()}
     worst = {
         "forward": float((image.cpu() - expected).abs().max()),

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kgs.geometry.types import Gaussians, RasterOptions
 from kgs.stages import composite, project
-from kgs.types import Gaussians, RasterOptions
 
 from .output import Row, markdown_table, write_plot, write_results
 from .scenes import DTYPES, PARAMETERS, Scene, cast, centred_camera, exact, gradients, layered_scene, relative_errors

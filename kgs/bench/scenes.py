@@ -12,10 +12,10 @@ from torch import Tensor
 
 import kgs.reference
 from kgs._support.errors import DataError
-from kgs.camera import pinhole_cameras
-from kgs.harmonics import SH_C0
+from kgs.geometry.cameras import pinhole_cameras, to
+from kgs.geometry.harmonics import SH_C0
+from kgs.geometry.types import Gaussians
 from kgs.model import GaussianModel
-from kgs.types import Gaussians
 
 SYNTHETIC = "synthetic"  # the name of the built-in scene in a cell
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
@@ -49,7 +49,7 @@ def layered_scene(count: int, size: tuple[int, int] = (378, 504), seed: int = 0)
         "sh_rest": rng.normal(0, 0.06, (count, 15, 3)),
     }
     model: Any = {name: torch.from_numpy(value.astype(np.float32)) for name, value in values.items()}
-    return GaussianModel(**model), cast_camera(centred_camera(size, focal), torch.float32)
+    return GaussianModel(**model), to(centred_camera(size, focal), dtype=torch.float32)
 
 
 def centred_camera(size: tuple[int, int], focal: float) -> PinholeCamera:
@@ -59,16 +59,11 @@ def centred_camera(size: tuple[int, int], focal: float) -> PinholeCamera:
     return pinhole_cameras(torch.eye(4).double(), torch.tensor(matrix, dtype=torch.float64), width, height)
 
 
-def cast_camera(camera: PinholeCamera, dtype: torch.dtype) -> PinholeCamera:
-    """The camera, rounded to a dtype."""
-    return PinholeCamera(camera.intrinsics.to(dtype), camera.extrinsics.to(dtype), camera.height, camera.width)
-
-
 def cast(scene: Scene, dtype: torch.dtype) -> Scene:
     """The scene rounded to a dtype; its Gaussians are leaves that want gradients."""
     gaussians, camera = scene
     leaves = {name: getattr(gaussians, name).detach().to(dtype).requires_grad_() for name in PARAMETERS}
-    return Gaussians(**leaves), cast_camera(camera, dtype)
+    return Gaussians(**leaves), to(camera, dtype=dtype)
 
 
 def gradients(image: Tensor, gaussians: Gaussians) -> dict[str, Tensor]:

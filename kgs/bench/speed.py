@@ -16,12 +16,12 @@ from torch import Tensor
 from kgs._support.machine import check_device, peak_rss_mb
 from kgs.backends import Backend, get_backend
 from kgs.backends.torch.binning import bin_to_tiles
-from kgs.camera import move_camera
 from kgs.fit.adam import Adam
+from kgs.geometry.cameras import to
+from kgs.geometry.types import Gaussians
 from kgs.losses import photometric_loss, target_moments
 from kgs.renderer import GaussianRenderer
 from kgs.stages import composite, project
-from kgs.types import Gaussians
 
 from .output import Row, markdown_table, write_plot, write_results
 from .scenes import PARAMETERS, layered_scene
@@ -108,7 +108,7 @@ class Cases:
         self.device = device
         self.renderer = GaussianRenderer(backend=backend)
         self.model = model.to(device)
-        self.camera = move_camera(camera, device)
+        self.camera = to(camera, device)
         generator = torch.Generator().manual_seed(0)
         self.weights = torch.rand(1, 3, *size, generator=generator).to(device) / math.prod(size)
         self.photo = torch.rand(1, 3, *size, generator=generator).to(device)

@@ -18,8 +18,10 @@ from torch import Tensor
 
 from kgs._support.errors import ArgumentError
 from kgs._support.progress import ProgressBar, silent
-from kgs.camera import move_camera
-from kgs.geometry import NEIGHBOURS, camera_centers, log_spacing, nearest_pixels, project_points, typical_depths
+from kgs.geometry.cameras import project, to
+from kgs.geometry.multiview import nearest_pixels, typical_depths
+from kgs.geometry.rigs import camera_centers
+from kgs.geometry.spacing import NEIGHBOURS, log_spacing
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 
@@ -235,7 +237,7 @@ def _evidence(means: Tensor, cameras: PinholeCamera, depths: Sequence[Tensor], b
 
     `behind` is how much farther the median depth is where a camera sees through.
     """
-    pixels, own_depths = project_points(means, cameras)
+    pixels, own_depths = project(cameras, means)
     confirmed = torch.zeros(len(means), dtype=torch.int64)
     seen_through = torch.zeros_like(confirmed)
     for view, depth in enumerate(depths):
@@ -273,7 +275,7 @@ def _changes(fit: Fit, rows: Tensor, levels: Sequence[float], bar: ProgressBar) 
         gaussians = fit.model()
     changes = torch.zeros_like(gaussians.opacities)
     for i in bar(range(len(views)), "strays", "view"):
-        camera = move_camera(views.camera(i), fit.device)
+        camera = to(views.camera(i), fit.device)
         squares = torch.zeros_like(changes)
         for _ in range(_SIGNS):
             factors = torch.ones_like(changes).requires_grad_()

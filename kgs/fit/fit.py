@@ -10,12 +10,12 @@ from torch import Tensor
 
 from kgs._support.torch_threads import threads_beside
 from kgs.backends import Backend, get_backend
-from kgs.camera import move_camera
 from kgs.datasets.scene import Scene, Views
+from kgs.geometry.cameras import to
+from kgs.geometry.types import RasterOptions
 from kgs.metrics.evaluate import mean_psnr
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer, blend
-from kgs.types import RasterOptions
 
 from .config import Settings
 from .decisions import Decisions
@@ -23,7 +23,7 @@ from .targets import background_of
 from .view_renders import ViewRenders
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fit:
     """A splat of a scene, and how it came about.
 
@@ -102,7 +102,7 @@ class Fit:
         return image, rendering.median_depth[0, 0].cpu()
 
     def _render(self, camera: PinholeCamera, gains: Tensor | None, *outputs: str) -> tuple[Tensor, Any]:
-        camera = move_camera(camera, self.device)
+        camera = to(camera, self.device)
         background = self._background if gains is None else None
         outputs = ("image", *outputs) if gains is None else ("image", "alpha", *outputs)
         with threads_beside(self.backend):
@@ -116,7 +116,7 @@ class Fit:
     def median_depth(self, camera: PinholeCamera) -> Tensor:
         """The median depth of the Gaussians from one camera, `(H, W)` on the CPU; 0 where there is nothing."""
         gaussians = self.model(backend=self._table)
-        rendering = self._renderer(gaussians, move_camera(camera, self.device), outputs=("median_depth",))
+        rendering = self._renderer(gaussians, to(camera, self.device), outputs=("median_depth",))
         depth: Tensor = rendering.median_depth[0, 0].cpu()
         return depth
 

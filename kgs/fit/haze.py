@@ -11,7 +11,8 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from kgs.datasets.splits import select_evenly
-from kgs.geometry import nearest_pixels, project_points
+from kgs.geometry.cameras import project
+from kgs.geometry.multiview import nearest_pixels
 
 from .fit import Fit
 
@@ -40,7 +41,7 @@ def veils(fit: Fit) -> Tensor:
         shown, photo, _ = views.compared(view, image)
         is_hazy = (darkest(shown[0]) - darkest(photo) > HAZE).cpu()
         height, width = surface.shape
-        pixels, depths = (values[:, 0] for values in project_points(means, camera))
+        pixels, depths = (values[:, 0] for values in project(camera, means))
         x, y, is_inside = nearest_pixels(pixels, depths, width, height)
         found |= is_inside & is_hazy[y, x] & (depths < FRONT * surface[y, x])
     return found

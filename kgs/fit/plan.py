@@ -6,12 +6,13 @@ from typing import NamedTuple, Self
 
 import torch
 
+from kgs._support.checks import check_kind
+from kgs._support.default_device import cpu_by_default
 from kgs._support.machine import check_device
 from kgs.backends import get_backend
 from kgs.datasets.scene import Scene
 from kgs.init_points import InitialPoints
 from kgs.init_points.dense import FEW_VIEWS
-from kgs.types import check_kind
 
 from .config import FitConfig, Settings
 from .decisions import Decisions
@@ -64,6 +65,7 @@ class Plan:
         return cls(config, device, backend, limit, make_schedule(config), decisions)
 
 
+@cpu_by_default
 def make_plan(scene: Scene, config: FitConfig, points: InitialPoints) -> Plan:
     """Settle all that a configuration leaves open.
 

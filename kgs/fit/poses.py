@@ -16,7 +16,8 @@ from torch import Tensor
 
 from kgs._support.errors import ArgumentError
 from kgs.datasets.scene import Scene
-from kgs.geometry import camera_centers, degrees_between
+from kgs.geometry.cameras import posed
+from kgs.geometry.rigs import camera_centers, degrees_between
 
 from .adam import Adam
 
@@ -56,7 +57,7 @@ class MovingPoses:
         """The camera of a view, at any resolution, at its current pose, whose gradient the next :meth:`step` uses."""
         pose = self.extrinsics[view : view + 1].to(camera.extrinsics).requires_grad_()
         self._seen = view, pose
-        return PinholeCamera(camera.intrinsics, pose, camera.height, camera.width)
+        return posed(camera, pose)
 
     @torch.no_grad()
     def step(self, progress: float) -> None:
@@ -117,9 +118,7 @@ class MovingPoses:
 def with_extrinsics(scene: Scene, extrinsics: Tensor) -> Scene:
     """The scene with training cameras at other poses, `(V, 4, 4)`."""
     cameras = scene.train.cameras
-    poses = extrinsics.to(cameras.extrinsics)
-    moved = PinholeCamera(cameras.intrinsics, poses, cameras.height, cameras.width)
-    return replace(scene, train=replace(scene.train, cameras=moved))
+    return replace(scene, train=replace(scene.train, cameras=posed(cameras, extrinsics.to(cameras.extrinsics))))
 
 
 def decayed(first: float, last: float, progress: float) -> float:

@@ -5,11 +5,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from kgs.camera import move_camera
 from kgs.datasets.scene import Views
+from kgs.geometry.cameras import to
+from kgs.geometry.types import RasterOptions
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
-from kgs.types import RasterOptions
 
 from .decisions import Decisions, PruningDecision
 from .fit import Fit
@@ -85,7 +85,7 @@ def contributions(model: GaussianModel, views: Views, options: RasterOptions, ba
         gaussians = model(backend=backend)
     colors = torch.zeros_like(gaussians.means).requires_grad_()
     for i in range(len(views)):
-        camera = move_camera(views.camera(i), colors.device)
+        camera = to(views.camera(i), colors.device)
         renderer(replace(gaussians, colors=colors), camera).image[:, 0].sum().backward()
     return torch.zeros_like(colors[:, 0]) if colors.grad is None else colors.grad[:, 0]
 

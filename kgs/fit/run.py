@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from os import PathLike
 from typing import Any
 
+from kgs._support.checks import check_kind
 from kgs._support.errors import DataError, quoted
 from kgs._support.progress import ProgressBar, silent
 from kgs.datasets.scene import Scene
 from kgs.init_points import InitialPoints, initial_points
 from kgs.init_points.in_view import check_in_view
-from kgs.types import check_kind
 
 from .config import FitConfig, min_side
 from .fit import Fit

@@ -3,10 +3,9 @@
 import math
 from dataclasses import replace
 
-from kornia.geometry.camera import PinholeCamera
-
 from kgs._support.errors import ArgumentError
 from kgs.datasets.scene import Scene, Views
+from kgs.geometry.cameras import posed
 from kgs.model import GaussianModel
 
 from .fit import Fit
@@ -67,8 +66,6 @@ def _scaled_scene(scene: Scene, factor: float) -> Scene:
 
 
 def _scaled_views(views: Views, factor: float) -> Views:
-    cameras = views.cameras
-    extrinsics = cameras.extrinsics.clone()
+    extrinsics = views.cameras.extrinsics.clone()
     extrinsics[:, :3, 3] *= factor
-    moved = PinholeCamera(cameras.intrinsics, extrinsics, cameras.height, cameras.width)
-    return replace(views, cameras=moved)
+    return replace(views, cameras=posed(views.cameras, extrinsics))

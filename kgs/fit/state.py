@@ -16,7 +16,8 @@ from kgs._support.json_files import is_number
 from kgs.datasets.scene import Scene, Views
 from kgs.densify import Densifier
 from kgs.drop import DropGaussian
-from kgs.geometry import camera_extent, typical_depths
+from kgs.geometry.multiview import typical_depths
+from kgs.geometry.rigs import camera_extent
 from kgs.init_points import InitialPoints
 from kgs.model import PARAMETERS, GaussianModel
 
@@ -46,7 +47,7 @@ class Start:
     depth: float
 
 
-@dataclass
+@dataclass(eq=False)
 class TrainState:
     """Everything that the rest of a fit depends on, besides its scene and its plan.
 

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from kgs._support.memory import empty
 from kgs.backends import Backend
-from kgs.camera import move_camera
 from kgs.datasets.scene import Scene, Views
+from kgs.geometry.cameras import to
 from kgs.losses import TargetMoments, target_moments
 
 _ABOVE_ONE = 1.0 + 2.0**-23  # the next float32: the gradient passes at 1, as it does in torch
@@ -80,7 +80,7 @@ def targets(views: Views, background: Tensor, device: torch.device) -> list[Targ
             mask = valid if mask is None else mask * valid
         made.append(
             Target(
-                camera=move_camera(views.camera(i), device),
+                camera=to(views.camera(i), device),
                 image=image,
                 moments=target_moments(image),
                 background_weight=background_weight,

@@ -19,15 +19,17 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from kgs._support.checks import check_kind
+from kgs._support.default_device import cpu_by_default
 from kgs._support.errors import ArgumentError, TrainingDiverged
 from kgs._support.torch_threads import threads_beside
 from kgs.backends import BACKENDS, get_backend
 from kgs.datasets.scene import Scene, Views
+from kgs.geometry.types import Gaussians, RasterOptions, Rendering
 from kgs.init_points import InitialPoints
 from kgs.losses import photometric_loss
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
-from kgs.types import Gaussians, RasterOptions, Rendering, check_kind
 
 from .checkpoint import errors_of, newest_checkpoint, previous, save_checkpoint
 from .config import FitConfig, Settings
@@ -64,6 +66,7 @@ class Trainer:
         is_saved: whether the last try to write one worked.
     """
 
+    @cpu_by_default
     def __init__(self, scene: Scene, plan: Plan, points: InitialPoints | dict[str, Any]) -> None:
         check_kind("scene", scene, Scene)
         check_kind("plan", plan, Plan)
@@ -150,6 +153,7 @@ class Trainer:
             notes=tuple(state.notes),
         )
 
+    @cpu_by_default
     def train_step(self) -> float:
         """One step and all that is due after it (curve, densification, reset of the opacities); returns the loss.
 

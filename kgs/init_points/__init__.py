@@ -5,16 +5,19 @@ from os import PathLike
 from pathlib import Path
 
 import torch
+from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from kgs._support.checks import check_kind
+from kgs._support.default_device import cpu_by_default
 from kgs._support.errors import ArgumentError, quoted, warn
 from kgs._support.machine import check_device
 from kgs._support.progress import ProgressBar, silent
 from kgs._support.shown import ShownByShapes
 from kgs.backends import check_backend
 from kgs.datasets.scene import Views
-from kgs.geometry import ViewGeometry
-from kgs.types import check_kind
+from kgs.geometry.cameras import project, to
+from kgs.geometry.multiview import inside_images, unproject
 
 from .agreement import interpolate
 from .dense import MIN_POINTS, dense_points
@@ -29,7 +32,7 @@ DRAWS = ("uniform", "spread")
 MIN_DENSE = 1000
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class InitialPoints(ShownByShapes):
     """The points that a fit starts from, with their colours.
 
@@ -48,6 +51,7 @@ class InitialPoints(ShownByShapes):
     views: Tensor | None = None
 
 
+@cpu_by_default
 def initial_points(
     views: Views,
     kind: str = "dense",
@@ -108,11 +112,11 @@ def initial_points(
         if file is None:
             raise ArgumentError("file", "a path for the kind 'file'", "None")
         return InitialPoints(*read_points(Path(file), origin), kind)
-    geometry = ViewGeometry.of(views.cameras)
-    tracked = certain_points(views, geometry, bar, backend)
+    cameras = to(views.cameras, "cpu", torch.float64)
+    tracked = certain_points(views, cameras, bar, backend)
     generator = torch.Generator().manual_seed(seed)
     if kind == "dense":
-        near, far = sweep_range(tracked, geometry)
+        near, far = sweep_range(tracked, cameras)
         dense = dense_points(views, near, far, count, generator, bar, backend, draw, pixels, where)
         if dense.agreed >= (MIN_DENSE if count is None else min(MIN_DENSE, count)):
             return InitialPoints(dense.points, dense.colors, kind, dense.patches, dense.views)
@@ -127,10 +131,10 @@ def initial_points(
             return InitialPoints(tracked.points.float(), colors, "sift")
         message = f"initial points: SIFT found {len(tracked)} in {len(views)} training views, fewer than {MIN_SIFT}; "
         warn(f"{message}the fit starts from {count} random points instead")
-    near, far = depth_range(tracked, geometry)
-    points = _random_points(geometry, count, near, far, generator)
-    projected, depths = geometry.project(points)
-    inside = geometry.inside_images(projected, depths, near, far)
+    near, far = depth_range(tracked, cameras)
+    points = _random_points(cameras, count, near, far, generator)
+    projected, depths = project(cameras, points)
+    inside = inside_images(cameras, projected, depths, near, far)
     usable = views.usable
     if usable is not None:
         inside &= _values_at(usable[:, None].float(), projected)[..., 0] > 0.5
@@ -138,17 +142,17 @@ def initial_points(
     return InitialPoints(points.float(), colors, "random")
 
 
-def _random_points(geometry: ViewGeometry, count: int, near: float, far: float, generator: torch.Generator) -> Tensor:
+def _random_points(cameras: PinholeCamera, count: int, near: float, far: float, generator: torch.Generator) -> Tensor:
     """Points of even density in the space that at least two views see, or one view if there is no such space."""
-    size = geometry.sizes[0]
+    size = torch.stack([cameras.width[0], cameras.height[0]]).double()
     accepted = list[Tensor]()
-    for required in [min(2, len(geometry))] * 50 + [1] * 50:
+    for required in [min(2, cameras.batch_size)] * 50 + [1] * 50:
         draws = torch.rand(4 * count, 4, generator=generator, dtype=torch.float64)
-        view = (torch.rand(4 * count, generator=generator, dtype=torch.float32) * len(geometry)).long()
+        view = (torch.rand(4 * count, generator=generator, dtype=torch.float32) * cameras.batch_size).long()
         depths = (near**3 + draws[:, 2] * (far**3 - near**3)) ** (1 / 3)
-        points = geometry.unproject(draws[:, :2] * size - 0.5, depths, view)
+        points = unproject(cameras, draws[:, :2] * size - 0.5, depths, view)
         # a point that k views see is drawn k times as often, so it is accepted with probability required / k
-        views_there = geometry.inside_images(*geometry.project(points), near, far).sum(1)
+        views_there = inside_images(cameras, *project(cameras, points), near, far).sum(1)
         accepted.append(points[(views_there >= required) & (draws[:, 3] * views_there < required)])
         if sum(map(len, accepted)) >= count:
             break

@@ -9,11 +9,12 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import torch
+from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import convert_points_to_homogeneous
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from kgs.geometry import ViewGeometry, nearest_pixels
+from kgs.geometry.multiview import nearest_pixels, relative_projection
 
 from .plane_sweep import DepthMap
 
@@ -35,7 +36,7 @@ LEVELS = 30_000  # of inverse depths, for OpenCV's filter
 NO_LEVEL = -LEVELS
 
 
-def average_depths(geometry: ViewGeometry, maps: list[DepthMap], certain: list[Tensor]) -> list[DepthMap]:
+def average_depths(cameras: PinholeCamera, maps: list[DepthMap], certain: list[Tensor]) -> list[DepthMap]:
     """Depth maps with the mean of the inverse depths of a certain pixel and of the views with a similar depth there.
 
     `certain` holds masks `(H, W)`; the other pixels keep their depths.
@@ -46,10 +47,10 @@ def average_depths(geometry: ViewGeometry, maps: list[DepthMap], certain: list[T
         rows, columns = certain[view].nonzero().unbind(1)
         total = inverse[view][rows, columns]
         count = torch.ones_like(total)
-        for other, pixels, depths in _in_other_views(geometry, own.depths[rows, columns], rows, columns, view):
+        for other, pixels, depths in _in_other_views(cameras, own.depths[rows, columns], rows, columns, view):
             x, y, inside = nearest_pixels(pixels, depths, *own.depths.mT.shape)
             other_depths = 1 / interpolate(inverse[other][None], pixels)[:, 0]
-            turn, shift = geometry.relative_projection(other, view)
+            turn, shift = relative_projection(cameras, other, view)
             own_depths = convert_points_to_homogeneous(pixels) @ turn[2] * other_depths + shift[2]
             similar = (other_depths / depths - 1).abs() < SIMILAR
             similar &= inside & certain[other][y, x] & (own_depths > 0)
@@ -61,9 +62,9 @@ def average_depths(geometry: ViewGeometry, maps: list[DepthMap], certain: list[T
     return averaged
 
 
-def consistent_pixels(geometry: ViewGeometry, maps: list[DepthMap], certain: list[Tensor], view: int) -> Tensor:
+def consistent_pixels(cameras: PinholeCamera, maps: list[DepthMap], certain: list[Tensor], view: int) -> Tensor:
     """Which of one view's certain pixels another view and their neighbours confirm, `(H, W)`."""
-    views = confirming_views(geometry, maps, certain, view)
+    views = confirming_views(cameras, maps, certain, view)
     confirmed = views > 0
     window = (WINDOW, WINDOW)
     counts = cv2.boxFilter(confirmed.float().numpy(), -1, window, normalize=False, borderType=cv2.BORDER_REPLICATE)
@@ -71,11 +72,11 @@ def consistent_pixels(geometry: ViewGeometry, maps: list[DepthMap], certain: lis
     return agreed & (~_strays(maps[view].depths, agreed) | (views >= min(2, len(maps) - 1)))
 
 
-def confirming_views(geometry: ViewGeometry, maps: list[DepthMap], certain: list[Tensor], view: int) -> Tensor:
+def confirming_views(cameras: PinholeCamera, maps: list[DepthMap], certain: list[Tensor], view: int) -> Tensor:
     """The number of other views that agree with each of one view's certain pixels, `(H, W)`."""
     rows, columns = certain[view].nonzero().unbind(1)
     views = torch.zeros_like(maps[view].depths)
-    for _, _, agrees in agreeing_views(geometry, maps, certain, rows, columns, view):
+    for _, _, agrees in agreeing_views(cameras, maps, certain, rows, columns, view):
         views[rows, columns] += agrees
     return views
 
@@ -99,15 +100,15 @@ def _strays(depths: Tensor, mask: Tensor) -> Tensor:
 
 
 def agreeing_views(
-    geometry: ViewGeometry, maps: list[DepthMap], certain: list[Tensor], rows: Tensor, columns: Tensor, view: int
+    cameras: PinholeCamera, maps: list[DepthMap], certain: list[Tensor], rows: Tensor, columns: Tensor, view: int
 ) -> Iterator[tuple[int, Tensor, Tensor]]:
     """Each other view, the positions `(P, 2)` of one view's pixels in it, and where it agrees, bool `(P,)`."""
     own_depths = maps[view].depths[rows, columns]
-    for other, pixels, depths in _in_other_views(geometry, own_depths, rows, columns, view):
+    for other, pixels, depths in _in_other_views(cameras, own_depths, rows, columns, view):
         x, y, inside = nearest_pixels(pixels, depths, *maps[view].depths.mT.shape)
         other_depths = maps[other].depths[y, x].double()
         # the other view's pixel as this view sees it: at the other view's depth, and at that of the point
-        turn, shift = geometry.relative_projection(other, view)
+        turn, shift = relative_projection(cameras, other, view)
         rays = _rays(x, y) @ turn.mT
         at_other_depth = _dehomogenise(rays * other_depths[:, None] + shift)
         at_own_depth = _dehomogenise(rays * depths[:, None] + shift)
@@ -117,13 +118,13 @@ def agreeing_views(
 
 
 def _in_other_views(
-    geometry: ViewGeometry, depths: Tensor, rows: Tensor, columns: Tensor, view: int
+    cameras: PinholeCamera, depths: Tensor, rows: Tensor, columns: Tensor, view: int
 ) -> Iterator[tuple[int, Tensor, Tensor]]:
     """Each other view, with the positions `(P, 2)` and depths `(P,)` in it of a view's pixels at some depths."""
     rays = _rays(columns, rows) * depths.double()[:, None]
-    for other in range(len(geometry)):
+    for other in range(cameras.batch_size):
         if other != view:
-            turn, shift = geometry.relative_projection(view, other)
+            turn, shift = relative_projection(cameras, view, other)
             there = rays @ turn.mT + shift
             yield other, _dehomogenise(there), there[:, 2]
 

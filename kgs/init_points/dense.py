@@ -10,12 +10,14 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from kornia.geometry.camera import PinholeCamera
 from numpy.typing import NDArray
 from torch import Tensor
 
 from kgs._support.progress import ProgressBar, silent
 from kgs.datasets.scene import Views
-from kgs.geometry import ViewGeometry
+from kgs.geometry.cameras import to
+from kgs.geometry.multiview import unproject
 
 from .agreement import average_depths, consistent_pixels
 from .patches import PatchColors, patch_colors
@@ -73,8 +75,8 @@ def dense_points(
     pixels = pixels or views.images[:, 0].numel()
     views = small_enough(views, near, far)
     maps, certain = agreed_depths(views, near, far, bar, backend, device)
-    geometry = ViewGeometry.of(views.cameras)
-    parts = [_agreed(views, geometry, maps, certain, view) for view in range(len(views))]
+    cameras = to(views.cameras, "cpu", torch.float64)
+    parts = [_agreed(views, cameras, maps, certain, view) for view in range(len(views))]
     points, colors, view_pixels = map(torch.cat, zip(*parts, strict=True))
     if count is None:
         agreed = round(pixels * len(points) / views.images[:, 0].numel())
@@ -86,7 +88,7 @@ def dense_points(
     chosen = chosen[_one_per_cell(view_pixels[chosen].numpy(), count)] if draw == "spread" else chosen[:count]
     chosen = chosen[_with_less_sky(is_sky[chosen])]
     of_view = [view_pixels[view == i, 1:] for i in range(len(views))]
-    patches = patch_colors(views, geometry, maps, certain, of_view)
+    patches = patch_colors(views, cameras, maps, certain, of_view)
     return DensePoints(points[chosen].float(), colors[chosen], int((~is_sky).sum()), patches, view[chosen])
 
 
@@ -116,7 +118,7 @@ def agreed_depths(
     usable = views.usable
     if usable is not None:
         certain = [mask & part for mask, part in zip(certain, usable.cpu(), strict=True)]
-    return average_depths(ViewGeometry.of(views.cameras), maps, certain), certain
+    return average_depths(to(views.cameras, "cpu", torch.float64), maps, certain), certain
 
 
 def _with_less_sky(is_sky: Tensor) -> Tensor:
@@ -151,12 +153,12 @@ def _first_of_each(numbers: NDArray[np.int64], end: int) -> NDArray[np.int64]:
 
 
 def _agreed(
-    views: Views, geometry: ViewGeometry, maps: list[DepthMap], certain: list[Tensor], view: int
+    views: Views, cameras: PinholeCamera, maps: list[DepthMap], certain: list[Tensor], view: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The points of one view's pixels on which views agree, their colours, and their `(view, x, y)`."""
-    rows, columns = consistent_pixels(geometry, maps, certain, view).nonzero().unbind(1)
+    rows, columns = consistent_pixels(cameras, maps, certain, view).nonzero().unbind(1)
     pixels = torch.stack([columns, rows], 1)
     depths = maps[view].depths[rows, columns].double()
-    points = geometry.unproject(pixels, depths, torch.full_like(rows, view))
+    points = unproject(cameras, pixels, depths, torch.full_like(rows, view))
     view_pixels = torch.stack([torch.full_like(rows, view), columns, rows], 1)
     return points, views.images[view].cpu()[:, rows, columns].mT, view_pixels

@@ -2,11 +2,14 @@
 
 import numpy as np
 import torch
+from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs._support.progress import ProgressBar, silent
 from kgs.datasets.scene import Views
-from kgs.geometry import ViewGeometry, log_spacing, meeting_point
+from kgs.geometry.multiview import inside_images
+from kgs.geometry.rigs import camera_centers, meeting_point
+from kgs.geometry.spacing import log_spacing
 
 from .tracks import find_tracks
 from .triangulate import TrackedPoints, triangulate_certain
@@ -16,33 +19,34 @@ MAX_SPACING = 4.0  # a point is isolated if its distance to its neighbours is la
 
 
 def certain_points(
-    views: Views, geometry: ViewGeometry, bar: ProgressBar = silent, backend: str = "auto"
+    views: Views, cameras: PinholeCamera, bar: ProgressBar = silent, backend: str = "auto"
 ) -> TrackedPoints:
     """The triangulated SIFT points of typical depths; if these are at least `MIN_SIFT`, without isolated ones."""
-    tracked = triangulate_certain(find_tracks(views, bar, backend), geometry)
+    tracked = triangulate_certain(find_tracks(views, bar, backend), cameras)
     tracked = tracked.select(_within_typical_depths(tracked))
-    return tracked.select(_has_neighbours(tracked, geometry)) if len(tracked) >= MIN_SIFT else tracked
+    return tracked.select(_has_neighbours(tracked, cameras)) if len(tracked) >= MIN_SIFT else tracked
 
 
-def depth_range(tracked: TrackedPoints, geometry: ViewGeometry) -> tuple[float, float]:
+def depth_range(tracked: TrackedPoints, cameras: PinholeCamera) -> tuple[float, float]:
     """The expected range of depths: from those of the points if they are at least two, else from the cameras."""
     if len(tracked) > 1:
         minimum, maximum = np.quantile(tracked.depths[tracked.depths > 0], (0.01, 0.99)).tolist()
         return 0.8 * minimum, 1.25 * maximum
-    meeting = meeting_point(geometry.extrinsics)
+    centers = camera_centers(cameras.extrinsics)
+    meeting = meeting_point(cameras.extrinsics)
     if meeting is not None:
-        axes = geometry.extrinsics[:, 2, :3]
-        to_meeting = ((meeting - geometry.centers) * axes).sum(1)
+        axes = cameras.extrinsics[:, 2, :3]
+        to_meeting = ((meeting - centers) * axes).sum(1)
         return 0.3 * float(to_meeting.min()), 2.0 * float(to_meeting.max())
-    baseline = float(torch.cdist(geometry.centers, geometry.centers).max()) or 1.0
+    baseline = float(torch.cdist(centers, centers).max()) or 1.0
     return baseline, 20.0 * baseline
 
 
-def sweep_range(tracked: TrackedPoints, geometry: ViewGeometry) -> tuple[float, float]:
+def sweep_range(tracked: TrackedPoints, cameras: PinholeCamera) -> tuple[float, float]:
     """The depths of the plane sweep: wider than those of all points, since cutting off the background costs quality."""
     if len(tracked) < MIN_SIFT:
-        return depth_range(tracked, geometry)
-    inside = tracked.depths[geometry.inside_images(tracked.pixels, tracked.depths)]
+        return depth_range(tracked, cameras)
+    inside = tracked.depths[inside_images(cameras, tracked.pixels, tracked.depths)]
     return 0.85 * float(inside.min()), 1.3 * float(inside.max())
 
 
@@ -59,9 +63,9 @@ def _within_typical_depths(tracked: TrackedPoints) -> Tensor:
     return typical.all(1)
 
 
-def _has_neighbours(tracked: TrackedPoints, geometry: ViewGeometry) -> Tensor:
+def _has_neighbours(tracked: TrackedPoints, cameras: PinholeCamera) -> Tensor:
     """Whether a point has others near it. Isolated points would get a huge scale, and are usually false matches."""
-    focal = geometry.intrinsics[:, 0, 0]
+    focal = cameras.intrinsics[:, 0, 0]
     pixels_per_unit = (focal / tracked.depths).masked_fill(~tracked.tracks.visible, 0.0).amax(1)
     spacing = log_spacing(tracked.points).exp() * pixels_per_unit
     return spacing < MAX_SPACING * spacing.median()

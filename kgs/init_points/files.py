@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kgs._support.errors import DataError
-from kgs.harmonics import SH_C0
+from kgs.geometry.harmonics import SH_C0
 from kgs.ply import load_ply
 
 _MAX_BYTES = 2**30

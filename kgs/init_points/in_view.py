@@ -6,7 +6,7 @@ from torch import Tensor
 
 from kgs._support.errors import DataError, listed, warn
 from kgs.datasets.scene import Views
-from kgs.geometry import points_in_images
+from kgs.geometry.multiview import points_in_images
 
 
 def check_in_view(points: Tensor, views: Views, path: str | PathLike[str]) -> None:

@@ -4,11 +4,13 @@ import math
 from dataclasses import dataclass
 
 import torch
+from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, normalize
 
 from kgs.datasets.scene import Views
-from kgs.geometry import ViewGeometry
+from kgs.geometry.multiview import unproject
+from kgs.geometry.rigs import camera_centers
 
 from .agreement import agreeing_views, interpolate
 from .plane_sweep import DepthMap
@@ -39,26 +41,26 @@ class PatchColors:
 
 
 def patch_colors(
-    views: Views, geometry: ViewGeometry, maps: list[DepthMap], certain: list[Tensor], agreed: list[Tensor]
+    views: Views, cameras: PinholeCamera, maps: list[DepthMap], certain: list[Tensor], agreed: list[Tensor]
 ) -> PatchColors:
     """The patches of all views: squares of 8 pixels, or of more in large images.
 
     `agreed` holds the columns and rows `(P, 2)` of each view's agreed pixels. The colour of a patch in another view is
     its own plus the mean difference, over the pixels that this view agrees on.
     """
-    parts = [_of_view(views, geometry, maps, certain, pixels, view) for view, pixels in enumerate(agreed)]
+    parts = [_of_view(views, cameras, maps, certain, pixels, view) for view, pixels in enumerate(agreed)]
     return PatchColors(*map(torch.cat, zip(*parts, strict=True)))
 
 
 def _of_view(
-    views: Views, geometry: ViewGeometry, maps: list[DepthMap], certain: list[Tensor], pixels: Tensor, view: int
+    views: Views, cameras: PinholeCamera, maps: list[DepthMap], certain: list[Tensor], pixels: Tensor, view: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Colours, visibility and directions of one view's patches."""
     images = views.images.cpu().float()
     stride = max(2, math.ceil(math.sqrt(images[0, 0].numel() / PIXELS)))
     columns, rows = pixels[(pixels % stride == 0).all(1)].unbind(1)
     depths = maps[view].depths[rows, columns].double()
-    points = geometry.unproject(torch.stack([columns, rows], 1), depths, torch.full_like(rows, view))
+    points = unproject(cameras, torch.stack([columns, rows], 1), depths, torch.full_like(rows, view))
     own = images[view][:, rows, columns].T
     size = [-(-length // (stride * SIDE)) * SIDE for length in images.shape[-2:]]
 
@@ -74,12 +76,12 @@ def _of_view(
     mean = sums(own, everywhere) / count.clamp_min(1)
     colors = mean[:, None].repeat(1, len(views), 1)
     visible = (count >= MIN_AGREED).repeat(1, len(views))
-    for other, projected, agrees in agreeing_views(geometry, maps, certain, rows, columns, view):
+    for other, projected, agrees in agreeing_views(cameras, maps, certain, rows, columns, view):
         difference = interpolate(images[other], projected) - own
         shared = sums(one, agrees)
         colors[:, other] += sums(difference, agrees) / shared.clamp_min(1)
         visible[:, other] &= ((shared >= MIN_AGREED) & (shared >= 0.5 * count))[:, 0]
     wanted = visible.sum(1) >= VIEWS
     centers = sums(points, everywhere)[wanted] / count[wanted]
-    directions = normalize(centers[:, None] - geometry.centers, dim=-1).float()
+    directions = normalize(centers[:, None] - camera_centers(cameras.extrinsics), dim=-1).float()
     return colors[wanted], visible[wanted], directions

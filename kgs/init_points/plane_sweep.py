@@ -9,13 +9,16 @@ from dataclasses import dataclass
 
 import torch
 from kornia.color import rgb_to_grayscale
+from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs._support.errors import ArgumentError
 from kgs._support.progress import ProgressBar, silent
 from kgs.backends import get_backend
 from kgs.datasets.scene import Views
-from kgs.geometry import ViewGeometry
+from kgs.geometry.cameras import to
+from kgs.geometry.multiview import relative_projection
+from kgs.geometry.rigs import camera_centers
 
 from .sweep_costs import sweep_costs
 
@@ -27,7 +30,7 @@ BASELINE = 0.15  # the best distance of a neighbour, over the depth: shorter is 
 FARTHEST = 100.0  # the largest depth of a sweep to infinity, in units of `far`
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DepthMap:
     """Depths and scores of the pixels of one view, `(H, W)`."""
 
@@ -62,14 +65,14 @@ def sweep_depths(
     typical = 2 / (1 / near + 1 / far)
     spacing = max((1 / near - 1 / far) / (planes - 1), 1 / near / (MAX_TO_INFINITY - 2))
     inverse = 1 / near - spacing * torch.arange(math.ceil(1 / near / spacing) + 2, dtype=torch.float64, device="cpu")
-    geometry = ViewGeometry.of(views.cameras)
+    cameras = to(views.cameras, "cpu", torch.float64)
     kernels = get_backend(backend, device, required=False)
     memory = grey.new_empty(2, *grey.shape[1:], len(inverse)) if device.type == "cpu" else None
     maps = []
     for view in bar(range(len(views)), "depth maps", "view"):
-        others = _neighbours(geometry, view, typical)
+        others = _neighbours(cameras, view, typical)
         if others:
-            homographies = torch.stack([_homographies(geometry, view, other, inverse) for other in others])
+            homographies = torch.stack([_homographies(cameras, view, other, inverse) for other in others])
             costs, unsmoothed = sweep_costs(grey[view], grey[others], homographies.to(device), kernels, memory)
             maps.append(_refine(costs, unsmoothed, inverse, FARTHEST * far))
         else:
@@ -85,13 +88,13 @@ def plane_count(wanted: float) -> int:
 
 def planes_wanted(views: Views, near: float, far: float) -> float:
     """By how many pixels the middle of a view moves in a neighbour from one depth to the other: the median."""
-    geometry = ViewGeometry.of(views.cameras)
+    cameras = to(views.cameras, "cpu", torch.float64)
     inverse = torch.linspace(1 / near, 1 / far, PLANES, dtype=torch.float64, device="cpu")
     middle = inverse.new_tensor([views.images.shape[-1] / 2, views.images.shape[-2] / 2, 1.0])
     steps = []
     for view in range(len(views)):
-        for other in _neighbours(geometry, view, 1 / float(inverse.mean())):
-            mapped = _homographies(geometry, view, other, inverse) @ middle
+        for other in _neighbours(cameras, view, 1 / float(inverse.mean())):
+            mapped = _homographies(cameras, view, other, inverse) @ middle
             mapped = mapped[mapped[:, 2] > 0]
             if len(mapped) > 1:
                 pixels = mapped[:, :2] / mapped[:, 2:]
@@ -99,16 +102,17 @@ def planes_wanted(views: Views, near: float, far: float) -> float:
     return PLANES * float(torch.stack(steps).median()) if steps else 0.0
 
 
-def _neighbours(geometry: ViewGeometry, view: int, depth: float) -> list[int]:
+def _neighbours(cameras: PinholeCamera, view: int, depth: float) -> list[int]:
     """The views to compare with, those first whose distance is nearest to `BASELINE`."""
-    baselines = (geometry.centers - geometry.centers[view]).norm(dim=1) / depth
+    centers = camera_centers(cameras.extrinsics)
+    baselines = (centers - centers[view]).norm(dim=1) / depth
     order = (baselines / BASELINE).log().abs().argsort(stable=True).tolist()
     return [other for other in order if baselines[other] > 0][:NEIGHBOURS]
 
 
-def _homographies(geometry: ViewGeometry, view: int, other: int, inverse: Tensor) -> Tensor:
+def _homographies(cameras: PinholeCamera, view: int, other: int, inverse: Tensor) -> Tensor:
     """From pixels of a view to those of another, for each plane, `(D, 3, 3)`: K' (R + t n^T / d) K^-1 at depth d."""
-    turn, shift = geometry.relative_projection(view, other)
+    turn, shift = relative_projection(cameras, view, other)
     homographies = turn.repeat(len(inverse), 1, 1)
     homographies[:, :, 2] += inverse[:, None] * shift
     return homographies

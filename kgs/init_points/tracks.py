@@ -24,7 +24,7 @@ from .matching import match
 SMALL_IMAGE = 200_000  # pixels; SIFT sees smaller images at twice their size, which gives 1.5 to 4 times the points
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Tracks:
     """T scene points as V views see them; on the CPU."""
 

@@ -12,7 +12,8 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs.datasets.scene import Scene
-from kgs.geometry import nearest_pixels, project_points, unproject
+from kgs.geometry.cameras import project
+from kgs.geometry.multiview import nearest_pixels, unproject
 
 MIN_VIEWS = 2  # training views that show a point
 OCCLUDED = 1.05  # a point is hidden from a view if it is farther than this times the view's depth there
@@ -73,8 +74,8 @@ def views_that_show(depth: Tensor, camera: PinholeCamera, depths: Sequence[Tenso
     height, width = depth.shape
     pixels = torch.ones_like(depth).nonzero().flip(1)  # (x, y), row by row
     own_depths = depth.reshape(-1).double()
-    points = unproject(pixels, own_depths, torch.zeros(len(pixels), dtype=torch.int64), camera)
-    other_pixels, other_depths = project_points(points, cameras)
+    points = unproject(camera, pixels, own_depths, torch.zeros(len(pixels), dtype=torch.int64))
+    other_pixels, other_depths = project(cameras, points)
     count = torch.zeros(len(pixels), dtype=torch.int64)
     for view, surface in enumerate(depths):
         point_depths = other_depths[:, view]

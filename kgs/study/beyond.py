@@ -25,7 +25,7 @@ from kgs.datasets.border import with_border
 from kgs.datasets.scene import Scene, Views
 from kgs.datasets.synthetic import synthetic_depths, views_beyond
 from kgs.fit.run import choose_points
-from kgs.geometry import camera_centers
+from kgs.geometry.rigs import camera_centers
 from kgs.metrics.coverage import views_that_show
 from kgs.metrics.evaluate import masked_psnr
 from kgs.metrics.lpips import Lpips

@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from kgs._support.errors import ArgumentError
-from kgs.camera import move_camera
 from kgs.datasets.scene import Views
 from kgs.fit.trainer import Trainer
-from kgs.geometry import camera_centers
+from kgs.geometry.cameras import to
+from kgs.geometry.rigs import camera_centers
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer
 
@@ -36,7 +36,7 @@ def coadaptation(
     total = 0.0
     pixels = 0
     for view in range(len(views)):
-        camera = move_camera(views.camera(view), opacities.device)
+        camera = to(views.camera(view), opacities.device)
         renders = []
         for _ in range(subsets):
             half = torch.rand(opacities.shape, generator=generator) < 0.5

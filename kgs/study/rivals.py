@@ -18,9 +18,9 @@ from kgs.drop import DropGaussian
 from kgs.fit.plan import Plan
 from kgs.fit.targets import Target
 from kgs.fit.trainer import Trainer
-from kgs.geometry import camera_centers
+from kgs.geometry.rigs import camera_centers
+from kgs.geometry.types import Gaussians, Rendering
 from kgs.init_points import InitialPoints
-from kgs.types import Gaussians, Rendering
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from kgs.app.page.fit_page import MAX_PICTURES
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.splits import select_evenly
 from kgs.fit.config import DROP
-from kgs.geometry import camera_centers
+from kgs.geometry.rigs import camera_centers
 
 TINY = ("--size", "40")
 PHOTO_SIZE = 335, 504  # height and width of the photos of the package
@@ -160,9 +160,9 @@ def test_sizes_that_cannot_be_fitted_and_photos_of_others_are_refused(demo, fold
     (tmp_path / "images").mkdir()
     (tmp_path / "images" / "mine.jpg").touch()
     assert run("demo", "-o", tmp_path) == 3
-    assert "got images/mine.jpg: move it away" in one_line(capsys)
+    assert "expected a new or empty folder, or one of kgs, got one with images" in one_line(capsys)
     assert run("fit", folder, "-o", demo) == 3
-    assert "choose another folder" in one_line(capsys)
+    assert "expected a folder for fit, got one of kgs with photos" in one_line(capsys)
     assert [path.name for path in tmp_path.iterdir()] == ["images"]
 
 

@@ -26,7 +26,7 @@ from kgs.app.files.preview import write_preview
 from kgs.app.files.results import Results
 from kgs.datasets import Scene
 from kgs.fit import Fit
-from kgs.geometry import typical_depths
+from kgs.geometry.multiview import typical_depths
 
 POINTS = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0))
 SKY = 300 * torch.nn.functional.normalize(torch.randn(450, 3, generator=torch.Generator().manual_seed(1)), dim=1)

@@ -24,7 +24,7 @@ from kgs.datasets import load_scene
 from kgs.datasets.scene import Views
 from kgs.fit.config import DEMO
 from kgs.fit.run import fit_scene
-from kgs.types import RasterOptions
+from kgs.geometry.types import RasterOptions
 
 SIZE = (150, 200)  # height, width
 BACKGROUND = torch.tensor([0.2, 0.5, 0.1])

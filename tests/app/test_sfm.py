@@ -28,7 +28,7 @@ from kgs.app.sfm.map import Solver
 from kgs.app.sfm.write import leveling, write_model
 from kgs.datasets import load_scene
 from kgs.errors import PhotosRefused
-from kgs.geometry import degrees_between
+from kgs.geometry.rigs import degrees_between
 
 pycolmap = pytest.importorskip("pycolmap")
 FOCAL = focal_length(SMALL[0])

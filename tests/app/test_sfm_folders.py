@@ -12,7 +12,7 @@ import pytest
 from command import run as command
 from init_point_scenes import cameras, texture
 from limits import limited
-from photo_folders import close, exif, planes, with_exif, write_photos, write_planes
+from photo_folders import close, planes, write_photos, write_planes
 
 from kgs._support.errors import DataError
 from kgs._support.progress import silent
@@ -20,7 +20,7 @@ from kgs.app.files.results import Results
 from kgs.app.sfm import pose, pose_photos
 from kgs.app.sfm.find import find_photos
 from kgs.app.sfm.pycolmap_processes import PycolmapProcesses
-from kgs.app.sfm.read import blurred, open_photos, read_photos, sharpness
+from kgs.app.sfm.read import open_photos, read_photos
 from kgs.app.sfm.source import Source
 
 pytest.importorskip("pycolmap")
@@ -203,44 +203,6 @@ def test_masks_are_used_and_what_looks_like_one_is_no_photo(folder):
     assert "1_mask.png" in note
 
 
-@pytest.mark.parametrize("stored", [False, True])
-def test_a_mask_is_upright_or_as_the_photo_is_stored(tmp_path, stored):
-    """Of a photo that its Exif turns by 90 degrees."""
-    upright = planes()[0]
-    jpeg = cv2.imencode(".jpg", np.rot90(upright))[1].tobytes()
-    (tmp_path / "a.jpg").write_bytes(with_exif(jpeg, exif(orientation=6)))
-    (tmp_path / "masks").mkdir()
-    mask = np.full((180, 240), 255, np.uint8)
-    mask[:, :40] = 0
-    cv2.imwrite(str(tmp_path / "masks" / "a.png"), np.rot90(mask) if stored else mask)
-    (photo,) = read_photos(open_photos([tmp_path / "a.jpg"], tmp_path / "masks"), silent)
-    assert photo.size == (240, 180)
-    assert np.array_equal(photo.mask, mask)
-
-
-@pytest.mark.parametrize("kind", ["alpha", "mask", "both"])
-def test_a_colour_that_is_hidden_does_not_show_in_a_reduced_photo(tmp_path, kind):
-    """One colour is seen, another is hidden: at the border only the first one shows."""
-    height, width = 1700, 1900
-    y, x = np.mgrid[:height, :width]
-    hidden = (np.hypot(x - 900, y - 850) < 501.3) | (x < 33)
-    image = np.where(hidden[..., None], np.uint8([0, 255, 0]), np.uint8([30, 60, 200]))
-    if kind != "mask":
-        image = np.dstack([image, np.where(hidden & (kind == "alpha") | (y > 1600), 0, 255).astype(np.uint8)])
-    cv2.imwrite(str(tmp_path / "a.png"), image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-    if kind != "alpha":
-        (tmp_path / "masks").mkdir()
-        cv2.imwrite(str(tmp_path / "masks" / "a.png"), np.where(hidden, 0, 255).astype(np.uint8))
-    masks = None if kind == "alpha" else tmp_path / "masks"
-    (photo,) = read_photos(open_photos([tmp_path / "a.png"], masks), silent)
-    seen = np.ones(photo.pixels.shape[:2], bool) if photo.mask is None else photo.mask > 0
-    if not photo.is_opaque:
-        seen &= photo.pixels[..., 3] > 0
-        assert not photo.pixels[photo.pixels[..., 3] == 0].any()
-    assert 0.5 < seen.mean() < 0.95
-    assert np.abs(photo.pixels[seen][:, :3].astype(int) - [200, 60, 30]).max() <= 1
-
-
 def test_what_is_called_like_masks_and_is_not_used_is_named(folder):
     save(save(folder, planes()) / "segmentation", planes()[:1])
     lone = ["0 (mask).png", "0_seg.png", "9_mask.png", "mask.png"]
@@ -251,17 +213,6 @@ def test_what_is_called_like_masks_and_is_not_used_is_named(folder):
     assert "--masks" in unused
     assert ", ".join(lone) in taken
     assert Source.open(folder).notes(folder / "segmentation") == [taken]
-
-
-@pytest.mark.slow
-def test_two_scenes_in_one_folder(folder, refused):
-    save(folder, small([*planes()[:2], *planes()[:2, :, ::-1]]))
-    text = refused(folder, "2 groups that do not overlap (1: 0.png, 1.png; 2: 2.png, 3.png)", "If they show two scenes")
-    rows = [line.split() for line in text.splitlines()[-4:]]
-    assert [row[:2] for row in rows] == [["1", "0.png"], ["2", "1.png"], ["3", "2.png"], ["4", "3.png"]]
-    assert int(rows[0][3]) == int(rows[1][2]) > 50  # a table is symmetric
-    assert max(int(rows[i][j]) for i in (0, 1) for j in (4, 5)) < 30
-    assert rows[3][5] == "."
 
 
 def test_a_camera_that_only_turned(folder, refused):
@@ -281,34 +232,6 @@ def test_walking_forward(tmp_path, refused):
     images = planes(cameras(np.array([[0.02, 0.0, -0.2], [0.0, 0.02, 0.0], [-0.02, 0.0, 0.2]]), 0.01))
     text = refused(write_photos(tmp_path / "photos", images), "step sideways, not forward", "Matches of each pair")
     assert "places between" not in text
-
-
-def test_a_blurred_photo_is_told(folder):
-    images = planes()
-    images[1] = cv2.GaussianBlur(images[1], (0, 0), 2.0)
-    save(folder, images)
-    assert [photo.path.name for photo in blurred(read_photos(open_photos(sorted(folder.iterdir())), silent))] == [
-        "1.png"
-    ]
-
-
-def test_what_a_mask_leaves_out_is_neither_sharp_nor_blurred(folder):
-    mask = np.full((180, 240), 255, np.uint8)
-    mask[40:140, 100:200] = 0
-    for hidden in (0, 255, np.random.default_rng(0).integers(0, 256, (180, 240, 3))):
-        image = np.where(mask[..., None] > 0, planes()[0], hidden).astype(np.uint8)
-        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        assert sharpness(grey, mask) == sharpness(cv2.cvtColor(planes()[0], cv2.COLOR_BGR2GRAY), mask)
-
-
-@pytest.mark.slow
-def test_photos_of_several_sizes_are_shrunk_to_the_smallest(folder):
-    save(folder, [planes()[0], *(cv2.resize(image, (480, 360)) for image in planes()[1:])])
-    photos = read_photos(open_photos(sorted(folder.iterdir())), silent)
-    assert {photo.size for photo in photos} == {(240, 180)}
-    large = cv2.resize(planes()[0], (2400, 1800))
-    save(folder, [large, large[::-1], large[:, ::-1]])
-    assert {photo.size for photo in read_photos(open_photos(sorted(folder.iterdir())), silent)} == {(1600, 1200)}
 
 
 def test_results_do_not_go_among_the_photos_or_over_another_scene(folder, tmp_path, refused):

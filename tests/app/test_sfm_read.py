@@ -12,7 +12,7 @@ from photo_folders import exif, planes, with_exif, write_photos
 from kgs._support.errors import DataError
 from kgs._support.progress import silent
 from kgs.app.sfm.match import lenses_of
-from kgs.app.sfm.read import Exif, open_photos, read_photos, unlike_others
+from kgs.app.sfm.read import Exif, blurred, open_photos, read_photos, sharpness, unlike_others
 from kgs.datasets.image_file import ImageFile
 
 JPEG = cv2.imencode(".jpg", planes()[0], [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
@@ -189,3 +189,66 @@ def test_of_a_photo_of_another_shape_the_middle_is_taken(tmp_path):
     assert (photos[4].mask[:, width // 2 + 1 :] == 0).all()
     assert photos[4].focal == pytest.approx(26 / np.hypot(36, 24) * np.hypot(240, 120) * scale)
     assert photos[5].focal == pytest.approx(photos[4].focal)
+
+
+@pytest.mark.parametrize("stored", [False, True])
+def test_a_mask_is_upright_or_as_the_photo_is_stored(tmp_path, stored):
+    """Of a photo that its Exif turns by 90 degrees."""
+    upright = planes()[0]
+    jpeg = cv2.imencode(".jpg", np.rot90(upright))[1].tobytes()
+    (tmp_path / "a.jpg").write_bytes(with_exif(jpeg, exif(orientation=6)))
+    (tmp_path / "masks").mkdir()
+    mask = np.full((180, 240), 255, np.uint8)
+    mask[:, :40] = 0
+    cv2.imwrite(str(tmp_path / "masks" / "a.png"), np.rot90(mask) if stored else mask)
+    (photo,) = read_photos(open_photos([tmp_path / "a.jpg"], tmp_path / "masks"), silent)
+    assert photo.size == (240, 180)
+    assert np.array_equal(photo.mask, mask)
+
+
+@pytest.mark.parametrize("kind", ["alpha", "mask", "both"])
+def test_a_colour_that_is_hidden_does_not_show_in_a_reduced_photo(tmp_path, kind):
+    """One colour is seen, another is hidden: at the border only the first one shows."""
+    height, width = 1700, 1900
+    y, x = np.mgrid[:height, :width]
+    hidden = (np.hypot(x - 900, y - 850) < 501.3) | (x < 33)
+    image = np.where(hidden[..., None], np.uint8([0, 255, 0]), np.uint8([30, 60, 200]))
+    if kind != "mask":
+        image = np.dstack([image, np.where(hidden & (kind == "alpha") | (y > 1600), 0, 255).astype(np.uint8)])
+    cv2.imwrite(str(tmp_path / "a.png"), image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    if kind != "alpha":
+        (tmp_path / "masks").mkdir()
+        cv2.imwrite(str(tmp_path / "masks" / "a.png"), np.where(hidden, 0, 255).astype(np.uint8))
+    masks = None if kind == "alpha" else tmp_path / "masks"
+    (photo,) = read_photos(open_photos([tmp_path / "a.png"], masks), silent)
+    seen = np.ones(photo.pixels.shape[:2], bool) if photo.mask is None else photo.mask > 0
+    if not photo.is_opaque:
+        seen &= photo.pixels[..., 3] > 0
+        assert not photo.pixels[photo.pixels[..., 3] == 0].any()
+    assert 0.5 < seen.mean() < 0.95
+    assert np.abs(photo.pixels[seen][:, :3].astype(int) - [200, 60, 30]).max() <= 1
+
+
+def test_a_blurred_photo_is_told(tmp_path):
+    images = list(planes())
+    images[1] = cv2.GaussianBlur(images[1], (0, 0), 2.0)
+    photos = read_photos(opened(tmp_path, images, [0] * 3), silent)
+    assert [photo.name for photo in blurred(photos)] == ["IMG_2.jpg"]
+
+
+def test_what_a_mask_leaves_out_is_neither_sharp_nor_blurred():
+    mask = np.full((180, 240), 255, np.uint8)
+    mask[40:140, 100:200] = 0
+    for hidden in (0, 255, np.random.default_rng(0).integers(0, 256, (180, 240, 3))):
+        image = np.where(mask[..., None] > 0, planes()[0], hidden).astype(np.uint8)
+        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        assert sharpness(grey, mask) == sharpness(cv2.cvtColor(planes()[0], cv2.COLOR_BGR2GRAY), mask)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "expected"), [([(240, 180), (480, 360), (480, 360)], (240, 180)), ([(2400, 1800)] * 2, (1600, 1200))]
+)
+def test_photos_are_shrunk_to_the_smallest_or_to_1600_pixels(tmp_path, sizes, expected):
+    images = [cv2.resize(image, size) for image, size in zip(planes(), sizes, strict=False)]
+    photos = read_photos(opened(tmp_path, images, [0] * len(sizes)), silent)
+    assert {photo.size for photo in photos} == {expected}

@@ -22,14 +22,14 @@ from targets import COMPILED, SELDOM_INTERPRETED, TORCH
 
 import kgs
 from kgs import GaussianRenderer, Gaussians, RasterOptions, composite, project
-from kgs.harmonics import SH_C0
+from kgs.geometry.harmonics import SH_C0
 
 
 def test_the_limits_of_the_tangents_belong_to_what_has_a_gradient(kernels):
     # x / z, y / z at, within and beyond the limits (8.5 + 2.4) / 8 and (4.5 + 1.2) / 8, both exact in binary
     camera = pinhole(8, 16, 8.0, (8.0, 4.0), dtype=torch.float32)
-    limits = kgs.camera.tangent_limits(
-        torch.tensor([8.0, 8.0]), torch.tensor([8.0, 4.0]), kgs.camera.whole_frame((8, 16))
+    limits = kgs.geometry.lenses.tangent_limits(
+        torch.tensor([8.0, 8.0]), torch.tensor([8.0, 4.0]), kgs.geometry.lenses.whole_frame((8, 16))
     )
     x = torch.stack([limits[0, 0], limits[0, 1], limits[0, 1] * 1.5, limits[0, 0] * 0.5])
     y = torch.stack([limits[1, 1], limits[1, 0] * 2, limits[1, 0], limits[1, 1] * 0.5])

@@ -23,7 +23,7 @@ def test_the_scene_keeps_its_footprints_and_pairs_per_gaussian():
         model, camera = layered_scene(count, size)
         assert isinstance(camera, PinholeCamera)
         projected = kgs.project(model(), camera)
-        xx, _, yy, det = kgs.covariance.variances(projected.factors, 0.3)
+        xx, _, yy, det = kgs.geometry.covariance.variances(projected.factors, 0.3)
         sizes.append(float(det.detach().pow(0.25).median()))
         inside = (projected.means2d > -0.5) & (projected.means2d < torch.tensor(size).flip(0) - 0.5)
         assert 0.7 < int(inside.all(1).sum()) / count < 0.82

@@ -11,7 +11,7 @@ from reference_checks import one
 
 import kgs.reference
 from kgs import GaussianRenderer, RasterOptions, project
-from kgs.covariance import compensations
+from kgs.geometry.covariance import compensations
 
 EXACT = {"alpha_threshold": 0.0, "transmittance_stop": 0.0}
 pytestmark = pytest.mark.usefixtures("each_backend")

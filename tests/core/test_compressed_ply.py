@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 import kgs
 from kgs.compressed_ply import save_compressed_ply
-from kgs.harmonics import SH_C0
+from kgs.geometry.harmonics import SH_C0
 
 LEVELS = np.array([2047, 1023, 2047])
 ANGLE = 0.3  # degrees
@@ -261,3 +261,43 @@ def test_the_reader_of_these_tests_reads_what_gsplat_writes(tmp_path: Path) -> N
     np.testing.assert_allclose(theirs["sh_rest"], ours["sh_rest"][rows], atol=20 / 255)
     lines = [header(tmp_path / name)[0] for name in ("theirs.ply", "ours.ply")]
     assert lines[0] == lines[1]
+
+
+@pytest.mark.parametrize(("n", "degree"), [(1, 0), (300, 1), (600, 3)])
+def test_load_ply_reads_what_was_written(tmp_path: Path, n: int, degree: int) -> None:
+    model = random_model(n, degree, seed=n)
+    model.antialiased = True
+    offset = torch.tensor([7.0, -8.0, 9.0], dtype=torch.float64)
+    save_compressed_ply(tmp_path / "a.ply", model, offset)
+    found = kgs.load_ply(tmp_path / "a.ply", offset)
+    decoded = decode(tmp_path / "a.ply")
+    decoded["means"] -= offset.numpy()
+    expected = as_model(decoded)
+    for name, value in found.named_parameters():
+        torch.testing.assert_close(value, expected.get_parameter(name), rtol=1e-5, atol=1e-5)
+    assert (found.sh_degree, found.antialiased) == (degree, True)
+
+
+def _without(word: str) -> Any:
+    """A header without the line of this word."""
+    return lambda text: "".join(line for line in text.splitlines(keepends=True) if f" {word}" not in line)
+
+
+@pytest.mark.parametrize(
+    ("key", "change"),
+    [
+        ("chunk", lambda text: text.replace("element chunk 2", "element chunk 1")),
+        ("chunk", lambda text: text.replace("element chunk", "element lump")),
+        ("min_r", _without("min_r")),
+        ("packed_scale", _without("packed_scale")),
+        ("sh", lambda text: text.replace("element sh 300", "element sh 299")),
+        ("f_rest", _without("f_rest_0")),
+    ],
+)
+def test_a_compressed_file_that_is_none_is_refused(tmp_path: Path, key: str, change: Any) -> None:
+    save_compressed_ply(tmp_path / "a.ply", random_model(300, 1, seed=0))
+    head, end, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
+    (tmp_path / "a.ply").write_bytes(change(head.decode()).encode() + end + body)
+    with pytest.raises(kgs.DataError) as caught:
+        kgs.load_ply(tmp_path / "a.ply")
+    assert caught.value.key == key

@@ -31,9 +31,9 @@ from kornia.sensors.camera import CameraModelType
 import kgs
 import kgs.reference
 from kgs._support.errors import ArgumentError, DataError, PhotosRefused, cause_of, quoted
-from kgs.camera import image_size
 from kgs.compressed_ply import save_compressed_ply
 from kgs.densify import Densifier
+from kgs.geometry.cameras import image_size
 from kgs.losses import photometric_loss, target_moments
 from kgs.ply import load_ply, save_ply
 
@@ -80,7 +80,7 @@ def bad_call_of_gsplat(name, dtype):
     def call():
         gaussians, seen = random_gaussians(3, 0, torch.float32, None), camera()
         given = vars(gaussians) | {"viewmats": seen.extrinsics, "Ks": seen.intrinsics[:, :3, :3]}
-        tensors = given | {"covars": torch.eye(3).expand(3, 3, 3), "extra_signals": torch.rand(3, 2)}
+        tensors = given | {"covars": torch.eye(3).expand(3, 3, 3)}
         wrong = None if dtype is None else tensors[name].to(dtype)
         kgs.rasterization(**given | {name: wrong}, width=12, height=9)
 
@@ -226,7 +226,7 @@ CASES = [
     *[bad_call_of_gsplat(name, None) for name in (*FIELDS, "viewmats", "Ks")],
     *[
         bad_call_of_gsplat(name, dtype)
-        for name in (*FIELDS[1:], "viewmats", "Ks", "covars", "extra_signals")
+        for name in (*FIELDS[1:], "viewmats", "Ks", "covars")
         for dtype in (torch.float64, torch.float16, torch.int64)
     ],
     # compositing

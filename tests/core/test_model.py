@@ -9,7 +9,7 @@ from factories import random_cloud as cloud
 from factories import random_model as model
 from torch import nn
 
-from kgs import GaussianRenderer
+from kgs import ArgumentError, GaussianRenderer
 from kgs.model import GaussianModel
 
 
@@ -154,3 +154,15 @@ def test_antialiased_is_kept_by_what_makes_another_model():
         assert again.antialiased
     made.sh_degree = 1
     assert repr(made) == "GaussianModel(7 Gaussians, sh_degree=1 of 3, torch.float64, antialiased)"
+
+
+@pytest.mark.parametrize("rows", [torch.ones(6, dtype=torch.bool), torch.ones(8, 1, dtype=torch.bool)])
+def test_a_mask_of_another_length_selects_nothing(rows):
+    with pytest.raises(ArgumentError) as caught:
+        model(7).select(rows)
+    assert (caught.value.name, caught.value.got) == ("rows", str(tuple(rows.shape)))
+
+
+def test_a_model_that_was_moved_to_half_precision_is_not_rendered(each_backend):
+    with pytest.raises(TypeError, match="bfloat16"):
+        model().to(torch.bfloat16)(backend=each_backend)

@@ -18,9 +18,9 @@ from kgs.app.page.data import pack
 from kgs.compressed_ply import save_compressed_ply
 from kgs.datasets import Views
 from kgs.fit.pruning import contributions
+from kgs.geometry.types import RasterOptions
 from kgs.model import GaussianModel
 from kgs.ply import load_ply, save_ply
-from kgs.types import RasterOptions
 
 
 def same(one, two):

@@ -156,8 +156,8 @@ GOOD = handmade(FLOATS, [ROW])
         (handmade([], [], count=10**17), "x", "got none"),
         (
             handmade([("packed_position", "uint"), ("packed_color", "uint")], [[1, 2]]),
-            "",
-            "take the PLY",
+            "chunk",
+            "expected one element of that name, got 0",
         ),
         (handmade(FLOATS, [ROW])[:-1], "vertex", "expected 68 bytes after the header, got 67"),
         (handmade(FLOATS, [ROW]) + b"\0", "vertex", "expected 68 bytes after the header, got 69"),

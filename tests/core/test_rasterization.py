@@ -7,10 +7,7 @@ import weakref
 import pytest
 import torch
 from factories import FIELDS, batch, leaves, random_camera, random_gaussians
-from kornia.geometry.conversions import quaternion_to_rotation_matrix
 
-import kgs
-import kgs.reference
 from kgs import GaussianRenderer, rasterization
 
 pytestmark = pytest.mark.usefixtures("each_backend")
@@ -94,7 +91,8 @@ REFUSED = {
     "with_eval3d": [True],
     "global_z_order": [False],
     "rays": [torch.zeros(2, 24, 32, 6)],
-    "extra_signals": [torch.zeros(59, 2).double()],
+    "extra_signals": [torch.zeros(60, 2).double()],
+    "return_normals": [True],
     "extra_signals_sh_degree": [3],
     "viewmats_rs": [torch.eye(4).expand(2, 4, 4)],
     "rolling_shutter": [RollingShutter.ROLLING_TOP_TO_BOTTOM],
@@ -104,7 +102,7 @@ REFUSED = {
     "sh_degree": [4, 0],
     "colors": [torch.zeros(59, 3).double(), torch.zeros(3, 60, 3).double()],
     "backgrounds": [torch.zeros(2, 4).double()],
-    "means": [torch.zeros(0, 60, 3).double(), torch.zeros(60, 2).double()],
+    "means": [torch.zeros(2, 60, 3).double(), torch.zeros(60, 2).double(), torch.tensor(1.0).double()],
     "viewmats": [
         torch.eye(4).double(),
         torch.eye(4).double().expand(0, 4, 4),
@@ -125,6 +123,13 @@ def test_what_kgs_does_not_do_is_an_error_that_names_the_argument(name, value):
     named = "colors" if (name, value) == ("sh_degree", 0) else name
     with pytest.raises(ValueError, match=f"^{named}:"):
         call(gaussians, cameras, **{name: value})
+
+
+@pytest.mark.usefixtures("torch_alone")
+def test_harmonics_through_an_orthographic_lens_are_refused():
+    """gsplat takes their directions from the camera's centre, kgs along the rays."""
+    with pytest.raises(ValueError, match="^sh_degree:"):
+        call(*scene(sh_degree=1), sh_degree=1, camera_model="ortho")
 
 
 @pytest.mark.usefixtures("torch_alone")
@@ -191,117 +196,30 @@ def test_the_dense_layout_says_what_the_packed_one_does():
 
 @pytest.mark.parametrize("packed", [True, False])
 @pytest.mark.parametrize("sh_degree", [None, 1])
-def test_leading_dimensions_are_scenes_of_their_own(packed, sh_degree):
-    """Two by three scenes at once, and each alone: images, gradients and what meta says."""
-    scenes = [(random_gaussians(20, b, torch.float32, sh_degree, 32), b) for b in range(6)]
-    cameras = [batch(*(random_camera(*SIZE, 2 * b + c, torch.float32) for c in range(2))) for _, b in scenes]
-    backgrounds = torch.rand(6, 2, 3)
-    options = {"sh_degree": sh_degree, "packed": packed, "absgrad": True, "render_mode": "RGB+ED"}
-
-    def stacked(values):
-        return torch.stack(list(values)).unflatten(0, (2, 3)).detach().requires_grad_()
-
-    together = {name: stacked(getattr(g, name) for g, _ in scenes) for name in FIELDS}
-    k = stacked(c.intrinsics[:, :3, :3] for c in cameras)
-    pose = stacked(c.extrinsics for c in cameras)
-    behind = backgrounds.unflatten(0, (2, 3))
-    renders, alphas, meta = rasterization(
-        **together, viewmats=pose, Ks=k, width=32, height=24, backgrounds=behind, **options
-    )
-    assert renders.shape == (2, 3, 2, 24, 32, 4)
-    assert alphas.shape == (2, 3, 2, 24, 32, 1)
-    assert (meta["n_batches"], meta["n_cameras"]) == (6, 2)
-    meta["means2d"].retain_grad()
-    (renders.square().sum() + alphas.sum()).backward()
-    for b, (gaussians, _) in enumerate(scenes):
-        inputs = leaves(gaussians)[1]
-        one, two = pose.flatten(0, 1)[b].detach(), k.flatten(0, 1)[b].detach()
-        image, alpha, alone = rasterization(*inputs, one, two, 32, 24, backgrounds=backgrounds[b], **options)
-        alone["means2d"].retain_grad()
-        (image.square().sum() + alpha.sum()).backward()
-        assert torch.equal(image, renders.flatten(0, 1)[b])
-        assert torch.equal(alpha, alphas.flatten(0, 1)[b])
-        for name, value in zip(FIELDS, inputs, strict=True):
-            assert torch.equal(together[name].grad.flatten(0, 1)[b], value.grad)
-        rows = meta["batch_ids"] == b if packed else (b // 3, b % 3)
-        for name in ("means2d", "radii", "conics"):
-            assert torch.equal(meta[name][rows], alone[name])
-        assert torch.equal(meta["means2d"].grad[rows], alone["means2d"].grad)
-        assert torch.equal(meta["means2d"].absgrad[rows], alone["means2d"].absgrad)
-        if packed:
-            assert torch.equal(meta["gaussian_ids"][rows], alone["gaussian_ids"])
-            assert torch.equal(meta["camera_ids"][rows], alone["camera_ids"])
-
-
-def test_scenes_may_share_their_harmonics():
-    gaussians, cameras = scene(1, torch.float32, cameras=1)
-    values = {name: getattr(gaussians, name).expand(3, *getattr(gaussians, name).shape) for name in FIELDS[:4]}
-    k, pose = cameras.intrinsics[:, :3, :3].expand(3, 1, 3, 3), cameras.extrinsics.expand(3, 1, 4, 4)
-    shared = rasterization(**values, colors=gaussians.colors, viewmats=pose, Ks=k, width=32, height=24, sh_degree=1)
-    own = gaussians.colors.expand(3, *gaussians.colors.shape)
-    assert torch.equal(
-        shared[0], rasterization(**values, colors=own, viewmats=pose, Ks=k, width=32, height=24, sh_degree=1)[0]
-    )
-
-
-@pytest.mark.parametrize("mode", ["RGB", "ED", "RGB+D"])
-@pytest.mark.parametrize("own", [False, True])
-def test_extra_signals_are_features_of_their_own(mode, own):
-    gaussians, cameras = scene(1, torch.float32)
-    signals = torch.randn(2, 60, 2, generator=torch.Generator().manual_seed(0))
-    signals = signals if own else signals[0]
-    renders, _, meta = call(gaussians, cameras, sh_degree=1, render_mode=mode, extra_signals=signals)
-    assert torch.allclose(renders, call(gaussians, cameras, sh_degree=1, render_mode=mode)[0], atol=1e-5)
-    assert torch.allclose(meta["render_extra_signals"], call(gaussians, cameras, colors=signals)[0], atol=1e-5)
-    if mode == "RGB":
-        backgrounds = torch.rand(2, 5)
-        over = call(gaussians, cameras, sh_degree=1, extra_signals=signals, backgrounds=backgrounds)
-        alone = call(gaussians, cameras, colors=signals, backgrounds=backgrounds[:, 3:])[0]
-        assert torch.allclose(over[2]["render_extra_signals"], alone, atol=1e-5)
-
-
-def test_normals_are_third_axes_towards_the_camera(exactly):
-    dtype, bound = exactly
-    gaussians, cameras = scene(cameras=1, dtype=dtype)
-    drawn = kgs.reference.layers(gaussians, cameras)
-    axes = quaternion_to_rotation_matrix(gaussians.quats)[:, :, 2].double()
-    pose = cameras.extrinsics[0].double()
-    away = gaussians.means.double() + pose[:3, :3].T @ pose[:3, 3]
-    axes = torch.where(((axes * away).sum(1) > 0)[:, None], -axes, axes)
-    expected = torch.einsum("lhw,lc->hwc", drawn.weights, axes[drawn.order])
-    normals = call(gaussians, cameras, return_normals=True)[2]["normals"]
-    assert torch.allclose(normals[0].double(), expected, atol=5 * bound)
-    with pytest.raises(ValueError, match="^return_normals:"):
-        call(gaussians, cameras, return_normals=True, covars=torch.eye(3, dtype=dtype).expand(60, 3, 3))
-
-
-@pytest.mark.parametrize("packed", [True, False])
-@pytest.mark.parametrize(("shape", "sh_degree"), [((), None), ((2,), 1), ((2, 3), None)])
-def test_no_gaussians_and_none_seen(packed, shape, sh_degree):
+def test_no_gaussians_and_none_seen(packed, sh_degree):
     cameras = batch(*(random_camera(*SIZE, seed, torch.float32) for seed in range(2)))
-    views = [x.expand(*shape, *x.shape) for x in (cameras.extrinsics, cameras.intrinsics[:, :3, :3])]
+    views = (cameras.extrinsics, cameras.intrinsics[:, :3, :3])
     for n in (0, 4):  # the four lie behind the cameras
-        values = [torch.rand(*shape, n, width) for width in (3, 4, 3)]
+        values = [torch.rand(n, width) for width in (3, 4, 3)]
         values[0][..., 2] -= 9.0
-        values += [torch.rand(*shape, n), torch.rand(*shape, n, *((3,) if sh_degree is None else (4, 3)))]
+        values += [torch.rand(n), torch.rand(n, *((3,) if sh_degree is None else (4, 3)))]
         leaves = [x.requires_grad_() for x in values]
         options = {"sh_degree": sh_degree, "packed": packed, "absgrad": True, "render_mode": "RGB+ED"}
         renders, alphas, meta = rasterization(*leaves, *views, 32, 24, **options)
-        assert renders.shape == (*shape, 2, 24, 32, 4)
+        assert renders.shape == (2, 24, 32, 4)
         assert not renders.any()
         assert not alphas.any()
-        assert meta["means2d"].shape == ((0, 2) if packed else (*shape, 2, n, 2))
+        assert meta["means2d"].shape == ((0, 2) if packed else (2, n, 2))
         if n:
             renders.sum().backward()
             assert not any(x.grad is not None and x.grad.any() for x in leaves)
 
 
-def test_features_of_no_width_in_a_batch():
+@pytest.mark.parametrize("shape", [(60, 0), (2, 60, 0)])
+def test_features_of_no_width(shape):
     gaussians, cameras = scene(dtype=torch.float32)
-    values = {name: torch.stack([getattr(gaussians, name)] * 2) for name in FIELDS} | {"colors": torch.zeros(2, 60, 0)}
-    views = {"viewmats": torch.stack([cameras.extrinsics] * 2), "Ks": torch.stack([cameras.intrinsics[:, :3, :3]] * 2)}
-    renders, _, _ = rasterization(**values, **views, width=32, height=24, render_mode="RGB+D")
-    assert renders.shape == (2, 2, 24, 32, 1)
+    renders, _, _ = call(gaussians, cameras, colors=torch.zeros(shape), render_mode="RGB+D")
+    assert renders.shape == (2, 24, 32, 1)
 
 
 @pytest.mark.parametrize("packed", [True, False])

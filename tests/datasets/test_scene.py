@@ -131,8 +131,9 @@ def check_float32(scene):
         scene.train.downsample(2),
         *([scene.train_full_size] if scene.train_full_size else []),
     ):
-        tensors = [part.images, part.cameras.intrinsics, part.cameras.extrinsics, part.cameras.height, part.cameras.fx]
-        tensors += [part.camera([0]).width] + ([] if part.alphas is None else [part.alphas])
+        tensors = [part.images, part.cameras.intrinsics, part.cameras.extrinsics, part.cameras.fx]
+        tensors += [] if part.alphas is None else [part.alphas]
+        assert part.cameras.height.device.type == part.camera([0]).width.device.type == "cpu"
         assert {(tensor.dtype, tensor.device.type) for tensor in tensors} == {(torch.float32, "cpu")}
         assert part.select([0]).images.device.type == "cpu"
     assert {t.dtype for t in (scene.points, scene.point_colors, scene.background)} == {torch.float32}

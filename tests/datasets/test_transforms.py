@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import torch
 from tiny_scenes import write_transforms
 
 from kgs._support.errors import DataError
@@ -179,6 +181,21 @@ def test_byte_order_marks_backslashes_and_poses_of_three_rows(tmp_path: Path, la
     after = load_scene(tmp_path).train
     assert after.names == before.names
     assert after.cameras.extrinsics.equal(before.cameras.extrinsics)
+
+
+@BOTH
+def test_poses_of_three_digits_become_rotations(tmp_path: Path, layout: str) -> None:
+    path = write(tmp_path, layout, LENS)
+    before = load_scene(tmp_path).train.cameras.extrinsics
+    content = json.loads(path.read_text())
+    for frame in content["frames"]:
+        frame["transform_matrix"] = [[round(x, 3) for x in row] for row in frame["transform_matrix"]]
+    path.write_text(json.dumps(content))
+    after = load_scene(tmp_path).train.cameras.extrinsics
+    assert not torch.equal(after, before)
+    torch.testing.assert_close(after, before, atol=4e-3, rtol=0)
+    rotation = after[:, :3, :3].double()
+    assert float((rotation.mT @ rotation - torch.eye(3)).abs().max()) < 1e-6
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import PIL.Image
 import pytest
 from tiny_scenes import update_json, write_blender, write_colmap, write_llff, write_nerfstudio
 
@@ -104,6 +105,13 @@ def gone(path: Path) -> None:
     path.with_name("2.png").unlink()
 
 
+def sideways(path: Path) -> None:
+    """As a phone stores an upright photo, its size in the scene's file being that of the upright one."""
+    exif = PIL.Image.Exif()
+    exif[0x112] = 6
+    PIL.Image.new("RGB", (12, 16)).save(path, exif=exif)
+
+
 POSES = "poses_bounds.npy"
 LLFF = [
     *[
@@ -171,6 +179,7 @@ COLMAP = [
 ]
 NERFSTUDIO_FILE = "transforms.json"
 TRAIN = "transforms_train.json"
+THIRD_POSE = "transform_matrix of ./train/2"
 UNUSABLE: list[tuple[str, Any]] = [
     ("k4", 0.1),  # nerfstudio: the fourth radial term; OpenCV: a denominator
     ("k6", -0.1),
@@ -227,6 +236,7 @@ NERFSTUDIO = [
         for said, where in [
             ({"camera_make": "Insta360", "camera_model": "EQUIRECTANGULAR"}, "camera_model"),
             ({"fl_x": 0}, "images/0.png"),
+            ({"fl_x": 0.9, "fl_y": 1.2, "cx": 0.5, "cy": 0.5}, "images/0.png"),  # shares of the sides
             ({"fl_x": None, "fl_y": None}, "fl_x"),
             ({"w": 16.5}, "w, h"),
             ({"w": 0}, "images/0.png"),
@@ -241,6 +251,7 @@ NERFSTUDIO = [
         ]
     ],
     (NERFSTUDIO_FILE, top(w=12, h=16), "images/1.png: "),
+    ("images/1.png", sideways, "images/1.png: expected a scaled version of the 16x12 that"),
     (NERFSTUDIO_FILE, frame(camera_model="OPENCV_FISHEYE", is_fisheye=False), f"{NERFSTUDIO_FILE}: is_fisheye of"),
     (NERFSTUDIO_FILE, frame(camera_model="OPENCV_FISHEYE", p1=0.01), f"{NERFSTUDIO_FILE}: p1 of images/2.png"),
 ]
@@ -255,7 +266,7 @@ BLENDER = [
     (TRAIN, frame(file_path="train/1"), f"{TRAIN}: train/1.png"),
     (TRAIN, frame(file_path="train/77"), ": expected 6 images, got 5: there is no train/77.png"),
     *[
-        (TRAIN, change, f"{TRAIN}: transform_matrix of ./train/2")
+        (TRAIN, change, f"{TRAIN}: {THIRD_POSE}")
         for change in (
             frame(transform_matrix=[[1, 0], [0, 1]]),
             frame(transform_matrix=None),
@@ -264,7 +275,13 @@ BLENDER = [
             *not_finite("transform_matrix", lambda transform_matrix: pose(0, 3, value=transform_matrix)),
         )
     ],
-    (TRAIN, pose([0, 1, 2], [0, 1, 2], value=1.01), f"{TRAIN}: train/2.png"),
+    (
+        TRAIN,
+        pose([0, 1, 2], [0, 1, 2], value=1.01),
+        f"{TRAIN}: {THIRD_POSE}: expected a rotation, got one scaled by 1.01: ",
+    ),
+    (TRAIN, pose(0, 1, value=0.25), f"{TRAIN}: {THIRD_POSE}: expected a right-handed rotation, got [[1.0, 0.25, 0.0]"),
+    (TRAIN, pose(2, 2, value=-1.0), f"{TRAIN}: {THIRD_POSE}: expected a right-handed rotation"),
     *[(TRAIN, content(written.encode()), f"{TRAIN}: ") for written in NO_OBJECTS],
     (TRAIN, content(b"\xff"), f"{TRAIN}: "),
     ("masks/0.png", picture(12, 16), "masks/0.png: "),  # of which of two photos?
@@ -289,3 +306,4 @@ def test_the_error_names_the_file_and_what_in_it(
     with pytest.raises(DataError) as error:
         load_scene(tmp_path, points="model-points" if layout == "COLMAP" else "none")
     assert str(error.value).removeprefix(str(tmp_path)).removeprefix("/").startswith(said)
+    assert ("Exif" in str(error.value)) == (change is sideways)

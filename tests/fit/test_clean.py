@@ -8,10 +8,11 @@ import pytest
 import torch
 
 from kgs import GaussianModel, pinhole_cameras
-from kgs.datasets.scene import Scene, Views, pinholes
+from kgs.datasets.scene import Scene, Views
 from kgs.fit import Fit
 from kgs.fit.clean import TOLERANCE, check_left, clean, find_strays
-from kgs.types import RasterOptions
+from kgs.geometry.cameras import posed
+from kgs.geometry.types import RasterOptions
 
 SIZE = (30, 40)
 SIDE = 40  # Gaussians along a side of the wall
@@ -179,6 +180,6 @@ def test_a_camera_that_sees_no_gaussian_decides_nothing(each_backend):
     views = fit.scene.train
     turned = views.cameras.extrinsics.clone()
     turned[1] = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])) @ turned[1]
-    views = replace(views, cameras=pinholes(views.cameras.intrinsics, turned, SIZE))
+    views = replace(views, cameras=posed(views.cameras, turned))
     cleaned = clean(replace(fit, scene=replace(fit.scene, train=views)), 4.0)
     assert cleaned.before[1] == cleaned.after[1]

@@ -13,7 +13,7 @@ from kgs.fit import Fit, FitConfig, fit_scene
 from kgs.fit.config import PAPER, Recipe
 from kgs.fit.haze import FADE, WINDOW, darkest, veils
 from kgs.fit.plan import make_schedule
-from kgs.types import RasterOptions
+from kgs.geometry.types import RasterOptions
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ from kgs.fit.checkpoint import load_checkpoint, save_checkpoint
 from kgs.fit.plan import make_plan
 from kgs.fit.poses import REACH, MovingPoses, decayed, with_extrinsics
 from kgs.fit.run import choose_points
-from kgs.geometry import camera_centers
+from kgs.geometry.rigs import camera_centers
 
 CONFIG = FitConfig(steps=6, seed=5, init="random", init_points=200, sh_degree=0, evaluations=1, refine_poses=True)
 DEPTH = 1.0

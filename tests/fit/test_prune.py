@@ -13,8 +13,8 @@ from kgs import GaussianModel
 from kgs.fit import Fit, FitConfig
 from kgs.fit.decisions import Decisions, DegreeDecision
 from kgs.fit.pruning import QUANTUM, TOLERANCE, contributions, left_out, prune
+from kgs.geometry.types import RasterOptions
 from kgs.reference import render
-from kgs.types import RasterOptions
 
 OTHERS = Decisions(sh_degree=DegreeDecision(0, "rule"))
 

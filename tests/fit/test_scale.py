@@ -7,8 +7,8 @@ from factories import as_model, random_gaussians, random_views
 from kgs.datasets import Scene
 from kgs.fit.fit import Fit
 from kgs.fit.scale import scaled, scaled_model
-from kgs.geometry import camera_centers
-from kgs.types import RasterOptions
+from kgs.geometry.rigs import camera_centers
+from kgs.geometry.types import RasterOptions
 
 FACTORS = (0.01, 3.7, 1000.0)
 

@@ -13,8 +13,10 @@ from kgs.fit import FitConfig, InitialPoints, view_dependence
 from kgs.fit.plan import make_plan
 from kgs.fit.run import choose_points
 from kgs.fit.view_dependence import MIN_GAIN, harmonics_kernel, possible_gain, without_exposure
-from kgs.geometry import ViewGeometry
-from kgs.harmonics import harmonics_basis
+from kgs.geometry.cameras import to
+from kgs.geometry.harmonics import harmonics_basis
+from kgs.geometry.multiview import unproject
+from kgs.geometry.rigs import camera_centers
 from kgs.init_points.patches import MIN_PATCHES, PatchColors
 
 VIEWS = 8
@@ -110,7 +112,7 @@ def test_exposures_are_removed():
 def with_harmonics(scene, depths, size):
     """The scene with harmonics on its surfaces, whose coefficients differ from place to place."""
     views = scene.train
-    geometry = ViewGeometry.of(views.cameras)
+    cameras = to(views.cameras, "cpu", torch.float64)
     images = views.images.clone()
     rng = generator()
     waves = 2.0 * torch.randn(3, 45, generator=rng, dtype=torch.float64)
@@ -118,8 +120,8 @@ def with_harmonics(scene, depths, size):
     for view in range(len(views)):
         rows, columns = (depths[view] > 0).nonzero().unbind(1)
         pixels = torch.stack([columns, rows], 1)
-        points = geometry.unproject(pixels, depths[view, rows, columns], torch.full_like(rows, view))
-        directions = torch.nn.functional.normalize(points - geometry.centers[view], dim=1)
+        points = unproject(cameras, pixels, depths[view, rows, columns], torch.full_like(rows, view))
+        directions = torch.nn.functional.normalize(points - camera_centers(cameras.extrinsics)[view], dim=1)
         coefficients = size * (points @ waves + phases).sin().reshape(-1, 15, 3)
         basis = harmonics_basis(directions, 3)[:, 1:, None]
         images[view, :, rows, columns] += (basis * coefficients).sum(1).T.float()

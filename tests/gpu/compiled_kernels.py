@@ -21,8 +21,8 @@ from kgs.backends import gpu
 from kgs.backends.gpu import launch as gpu_launch
 from kgs.bench.scenes import layered_scene
 from kgs.bench.speed import Cases
-from kgs.camera import pinhole_cameras
 from kgs.densify import Densifier
+from kgs.geometry.cameras import pinhole_cameras
 from kgs.renderer import GaussianRenderer
 
 TARGETS = {

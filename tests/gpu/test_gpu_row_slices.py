@@ -11,7 +11,7 @@ from kgs.backends import row_slices
 from kgs.backends.gpu import compositing
 from kgs.backends.gpu.compositing_kernels import ROW, sum_entries
 from kgs.backends.gpu.launch import blocks, launch
-from kgs.covariance import moment_gradients
+from kgs.geometry.covariance import moment_gradients
 
 GIB = 2**30
 KERNELS = Target("triton")

@@ -11,9 +11,10 @@ import torch
 import trimesh
 
 from kgs.datasets import synthetic
-from kgs.datasets.scene import Scene, Views, pinholes
+from kgs.datasets.scene import Scene, Views
 from kgs.datasets.synthetic.raycast import raycast
 from kgs.datasets.synthetic.textures import field
+from kgs.geometry.cameras import pinhole_cameras, select
 
 CENTER = np.array([0.0, -0.75, 0.0])  # what the cameras look at: the horizon is in the middle of the image
 ABOVE = np.array([[-0.45, -1.5, -1.6], [0.0, -1.725, -1.6], [0.45, -1.5, -1.6]])  # m from there, eyes that see no sky
@@ -69,9 +70,10 @@ def yard_views(eyes: Any, size: tuple[int, int], seed: int = 0, name: str = "pho
     for pose, eye in zip(extrinsics, CENTER + eyes, strict=True):
         pose[:] = torch.from_numpy(synthetic._look_at(eye, CENTER))
     images = torch.zeros(len(eyes), 3, *size)
-    for image, *matrices in zip(images, intrinsics, extrinsics, strict=True):
-        image[:] = torch.from_numpy(synthetic._render(make_yard(seed), *(m.double().numpy() for m in matrices), size))
-    return Views(pinholes(intrinsics, extrinsics, size), images, tuple(f"{name}_{i:02d}" for i in range(len(eyes))))
+    cameras = pinhole_cameras(extrinsics, intrinsics, *size[::-1])
+    for i, image in enumerate(images):
+        image[:] = torch.from_numpy(synthetic._render(make_yard(seed), select(cameras, i), size))
+    return Views(cameras, images, tuple(f"{name}_{i:02d}" for i in range(len(eyes))))
 
 
 def yard_depths(views: Views, seed: int = 0) -> torch.Tensor:

@@ -23,7 +23,7 @@ from kernel_checks import check_bits
 from kornia.geometry.camera import PinholeCamera
 
 from kgs.app.console import each
-from kgs.geometry import typical_depths
+from kgs.geometry.multiview import typical_depths
 from kgs.init_points import initial_points
 
 

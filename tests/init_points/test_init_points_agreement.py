@@ -5,14 +5,14 @@ import pytest
 import torch
 from init_point_scenes import cameras
 
-from kgs.geometry import ViewGeometry
+from kgs.geometry.cameras import to
 from kgs.init_points import agreement
 from kgs.init_points.agreement import average_depths, consistent_pixels
 from kgs.init_points.plane_sweep import DepthMap
 
 WIDTH, HEIGHT, DEPTH = 40, 30, 4.0
 BESIDE = cameras(np.array([[0.0, 0.0, 0.0], [0.4, 0.0, 0.0]]), turn=0.0, size=(WIDTH, HEIGHT))
-GEOMETRY = ViewGeometry.of(BESIDE)
+GEOMETRY = to(BESIDE, "cpu", torch.float64)
 EVERYWHERE = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
 SHARED = (slice(None), slice(5, None))  # of the first view: the second camera sees it 3.5 pixels further left
 
@@ -70,7 +70,7 @@ def test_a_small_piece_before_its_surroundings_needs_two_other_views(confirming,
     for view, shift in enumerate([0, -7, 7][: 1 + confirming]):  # at half the depth twice as far
         left = 17 + shift
         maps[view].depths[12 : 12 + SQUARE, left : left + SQUARE] = DEPTH / 2
-    kept = consistent_pixels(ViewGeometry.of(beside), maps, 3 * [EVERYWHERE], 0)
+    kept = consistent_pixels(to(beside, "cpu", torch.float64), maps, 3 * [EVERYWHERE], 0)
     inside = kept[13 : 11 + SQUARE, 18 : 16 + SQUARE]
     assert bool(inside.any()) == bool(inside.all()) == (confirming == 2)
     assert bool(kept[:8, 8:-8].all())  # the wall

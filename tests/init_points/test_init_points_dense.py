@@ -10,7 +10,9 @@ from yard import yard_depths, yard_from_above, yard_scene
 
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
-from kgs.geometry import ViewGeometry, camera_centers, nearest_pixels, project_points
+from kgs.geometry.cameras import project, to
+from kgs.geometry.multiview import nearest_pixels
+from kgs.geometry.rigs import camera_centers
 from kgs.init_points import dense, initial_points
 from kgs.init_points.dense import PER_SKY, SKY, _one_per_cell, dense_points, small_enough
 from kgs.init_points.depth_limits import MIN_SIFT, sweep_range
@@ -67,7 +69,7 @@ def test_points_lie_on_the_surfaces(large):
     assert points.shape == colors.shape == (len(points), 3)
     assert len(points) > 25_000
     assert points.dtype == colors.dtype == torch.float32
-    pixels, depths = project_points(points, views.cameras)
+    pixels, depths = project(views.cameras, points)
     x, y = (pixels[..., 0].round().long().clamp(0, 127), pixels[..., 1].round().long().clamp(0, 95))
     errors = torch.stack([(depths[:, v] / truth[v][y[:, v], x[:, v]] - 1).abs() for v in range(3)]).amin(0)
     assert float(errors.median()) < 0.01
@@ -80,7 +82,7 @@ def test_points_lie_where_the_masks_are(views, span):
     masks = torch.zeros(3, 1, 72, 96)
     masks[..., 15:55, 20:80] = 1.0
     points, *_ = dense_points(replace(views, alphas=masks), *span, 2000, generator())
-    pixels, _ = project_points(points, views.cameras)
+    pixels, _ = project(views.cameras, points)
     x, y = pixels.round().long().unbind(-1)
     inside = (x >= 20) & (x < 80) & (y >= 15) & (y < 55)
     assert len(points) > 300
@@ -121,20 +123,20 @@ def test_neighbours_stand_neither_too_near_nor_too_far(views):
     extrinsics[:, 0, 3] = -centers
     first = views.camera(0)
     camera = PinholeCamera(first.intrinsics.repeat(n, 1, 1), extrinsics, first.height.repeat(n), first.width.repeat(n))
-    line = ViewGeometry.of(camera)
+    line = to(camera, "cpu", torch.float64)
     assert sorted(_neighbours(line, 0, 3.0)) == [3, 4, 5, 6]
     assert _neighbours(line, 7, 3.0)[0] == 6
 
 
 def test_points_that_no_view_has_do_not_stretch_the_planes(views):
-    geometry = ViewGeometry.of(views.cameras)
-    near_camera = torch.linalg.inv(geometry.extrinsics[0]) @ torch.tensor([0.5, 0.0, 0.05, 1.0]).double()
+    cameras = to(views.cameras, "cpu", torch.float64)
+    near_camera = torch.linalg.inv(cameras.extrinsics[0]) @ torch.tensor([0.5, 0.0, 0.05, 1.0]).double()
     scene = torch.rand(MIN_SIFT, 3, generator=generator(), dtype=torch.float64) + torch.tensor([-0.5, -0.5, 4.0])
 
     def swept(points):
-        pixels, depths = geometry.project(points)
+        pixels, depths = project(cameras, points)
         everywhere = torch.ones(depths.shape, dtype=torch.bool)
-        return sweep_range(TrackedPoints(points, pixels, depths, Tracks(pixels, everywhere)), geometry)
+        return sweep_range(TrackedPoints(points, pixels, depths, Tracks(pixels, everywhere)), cameras)
 
     assert swept(torch.cat([scene, near_camera[None, :3]])) == swept(scene)
 
@@ -240,7 +242,7 @@ def before_a_sky():
 def test_points_of_the_sky_are_as_good_as_infinitely_far_away(before_a_sky):
     sky, (near, far) = before_a_sky
     points, *_ = dense_points(sky, near, far, 2000, generator(), draw="spread")
-    pixels, depths = project_points(points, sky.cameras)
+    pixels, depths = project(sky.cameras, points)
     assert float(depths.max()) < 1.5 * FARTHEST * far  # in another camera a depth may be larger
     truth = yard_depths(sky)
     shares = []
@@ -264,7 +266,7 @@ def test_where_there_is_no_sky_no_point_is_far_away(views, span):
         assert float(found.depths.max()) <= 1.001 * FARTHEST * span[1]
         assert float(found.depths.min()) > 0
     points, *_ = dense_points(small, *span, 2000, generator())
-    assert float((project_points(points, views.cameras)[1] > 1.5 * span[1]).double().mean()) < 0.005
+    assert float((project(views.cameras, points)[1] > 1.5 * span[1]).double().mean()) < 0.005
 
 
 def test_views_are_halved_until_planes_lie_close_together(views, monkeypatch):

@@ -4,14 +4,16 @@ import numpy as np
 import torch
 from init_point_scenes import as_views, cameras
 
-from kgs.geometry import ViewGeometry
+from kgs.geometry.cameras import to
+from kgs.geometry.multiview import inverse_intrinsics
+from kgs.geometry.rigs import camera_centers
 from kgs.init_points.patches import MIN_AGREED, patch_colors
 from kgs.init_points.plane_sweep import DepthMap
 
 WIDTH, HEIGHT, DEPTH = 40, 32, 4.0
 CENTERS = np.array([[-0.2, 0.0, 0.0], [0.0, 0.1, 0.0], [0.2, 0.0, 0.0], [0.4, 0.1, 0.0]])
 POSED = cameras(CENTERS, turn=0.05, size=(WIDTH, HEIGHT))
-GEOMETRY = ViewGeometry.of(POSED)
+GEOMETRY = to(POSED, "cpu", torch.float64)
 EVERYWHERE = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
 PIXELS = torch.cartesian_prod(torch.arange(WIDTH), torch.arange(HEIGHT))
 TINTS = torch.tensor([0.0, 0.1, 0.2, 0.3])  # each camera sees the wall in another colour
@@ -19,10 +21,10 @@ TINTS = torch.tensor([0.0, 0.1, 0.2, 0.3])  # each camera sees the wall in anoth
 
 def walls():
     """The depths of the wall z = DEPTH in each view, and images of it."""
-    rays = torch.cat([PIXELS.double(), torch.ones(len(PIXELS), 1)], 1) @ GEOMETRY.inverse_intrinsics.mT
+    rays = torch.cat([PIXELS.double(), torch.ones(len(PIXELS), 1)], 1) @ inverse_intrinsics(GEOMETRY).mT
     world = rays @ GEOMETRY.extrinsics[:, :3, :3]
-    depths = (DEPTH - GEOMETRY.centers[:, None, 2:]) / world[..., 2:]
-    points = GEOMETRY.centers[:, None] + depths * world
+    depths = (DEPTH - camera_centers(GEOMETRY.extrinsics)[:, None, 2:]) / world[..., 2:]
+    points = camera_centers(GEOMETRY.extrinsics)[:, None] + depths * world
     colors = 0.3 + 0.02 * points[..., [0, 1, 0]] + TINTS[:, None, None]
 
     def as_images(values):
@@ -43,8 +45,8 @@ def test_patches_have_the_colours_and_directions_of_the_wall():
     plain = torch.where(patches.visible[..., None], patches.colors - TINTS[:, None], 0.0)
     means = plain.sum(1, keepdim=True) / patches.visible.sum(1)[:, None, None]
     torch.testing.assert_close(plain[patches.visible], means.expand_as(plain)[patches.visible], atol=2e-4, rtol=0)
-    to_wall = (DEPTH - GEOMETRY.centers[:, 2]) / patches.directions[..., 2]
-    points = GEOMETRY.centers + to_wall[..., None] * patches.directions
+    to_wall = (DEPTH - camera_centers(GEOMETRY.extrinsics)[:, 2]) / patches.directions[..., 2]
+    points = camera_centers(GEOMETRY.extrinsics) + to_wall[..., None] * patches.directions
     torch.testing.assert_close(points, points[:, :1].expand_as(points), atol=1e-5, rtol=0)
     torch.testing.assert_close(means[:, 0, :2], (0.3 + 0.02 * points[:, 0, :2]).float(), atol=2e-4, rtol=0)
 

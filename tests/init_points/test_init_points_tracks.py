@@ -7,7 +7,7 @@ import torch
 from init_point_scenes import HEIGHT, WIDTH, as_views, cameras, exact_tracks, focal_length, texture
 from kornia.geometry.camera import PinholeCamera
 
-from kgs.geometry import ViewGeometry
+from kgs.geometry.cameras import to
 from kgs.init_points.tracks import Tracks, find_tracks
 from kgs.init_points.triangulate import triangulate, triangulate_certain
 
@@ -64,7 +64,7 @@ def test_triangulation_agrees_with_opencv_for_two_views():
     projections = posed.extrinsics[:, :3].double().numpy()
     expected = cv2.triangulatePoints(projections[0], projections[2], rays[:, 0, :2].T, rays[:, 2, :2].T)
     expected = (expected[:3] / expected[3]).T
-    points = triangulate(Tracks(torch.from_numpy(pixels), visible), ViewGeometry.of(posed)).numpy()
+    points = triangulate(Tracks(torch.from_numpy(pixels), visible), to(posed, "cpu", torch.float64)).numpy()
     np.testing.assert_allclose(points, expected, rtol=0.02, atol=0.02)
 
 
@@ -75,9 +75,9 @@ def test_exact_tracks_give_exact_points_also_of_a_moved_and_scaled_world():
     extrinsics[:, :3, 3] = 100 * (extrinsics[:, :3, 3] - extrinsics[:, :3, :3] @ shift.double())
     moved = PinholeCamera(posed.intrinsics.double(), extrinsics, posed.height, posed.width)
     tracks = exact_tracks(points)
-    expected = triangulate_certain(tracks, ViewGeometry.of(posed))
+    expected = triangulate_certain(tracks, to(posed, "cpu", torch.float64))
     torch.testing.assert_close(expected.points.float(), points, rtol=1e-4, atol=1e-4)
-    certain = triangulate_certain(tracks, ViewGeometry.of(moved))
+    certain = triangulate_certain(tracks, to(moved, "cpu", torch.float64))
     assert bool(certain.tracks.visible.all())
     torch.testing.assert_close(certain.points / 100 - shift, expected.points, rtol=1e-9, atol=1e-9)
 
@@ -88,6 +88,6 @@ def test_uncertain_points_go():
     tracks = exact_tracks(points)
     tracks.pixels[2, 1, 1] += 3.0
     tracks.pixels[3, 1, 1] += 40.0
-    certain = triangulate_certain(tracks, ViewGeometry.of(cameras()))
+    certain = triangulate_certain(tracks, to(cameras(), "cpu", torch.float64))
     torch.testing.assert_close(certain.points.float(), points[[0, 2]], rtol=1e-4, atol=1e-4)
     assert certain.tracks.visible.tolist() == [[True, True, True], [True, False, True]]

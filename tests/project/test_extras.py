@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from kgs._support.extras import check_opencv
-from kgs.geometry import log_spacing
+from kgs.geometry.spacing import log_spacing
 
 REQUIRED_ALONE = """
 import sys
@@ -51,7 +51,7 @@ def test_spacings_without_opencv_are_those_with_it(monkeypatch, copies):
     points = torch.rand(300, 3, generator=torch.Generator().manual_seed(0)).repeat(copies, 1)
     expected = log_spacing(points)
     monkeypatch.setitem(sys.modules, "cv2", None)
-    monkeypatch.setattr("kgs.geometry._MAX_DISTANCES", 7000)  # several blocks
+    monkeypatch.setattr("kgs.geometry.spacing._MAX_DISTANCES", 7000)  # several blocks
     torch.testing.assert_close(log_spacing(points), expected, rtol=0, atol=1e-6)
 
 

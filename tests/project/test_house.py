@@ -15,16 +15,17 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PACKAGES = {"kgs": "kgs", "losses": "kgs.losses", "datasets": "kgs.datasets"}  # folder, and the name it is installed by
 PUBLIC = ("kgs", "kgs.losses", "kgs.datasets", "kgs.reference", "kgs.fit")
-GROUND = {"core", "backends", "_support"}  # what stands in kgs itself is the core
+GROUND = {"core", "backends", "geometry", "_support"}  # what stands in kgs itself is the core
 LIBRARY = {*GROUND, "gsplat", "losses", "datasets", "metrics", "init_points", "fit", "bench"}
 MAY_IMPORT = {  # a room, and the others that it may import
-    "kgs": {"core", "gsplat", "_support"},  # the face, which names what is elsewhere
-    "core": {"backends", "_support"},
+    "kgs": {"core", "geometry", "gsplat", "_support"},  # the face, which names what is elsewhere
+    "core": {"backends", "geometry", "_support"},
     "_support": set(),
-    "backends": GROUND,
+    "geometry": {"_support"},
+    "backends": {"geometry", "_support"},
     "gsplat": GROUND,
     "losses": {"backends", "_support"},
-    "datasets": {"core", "_support"},
+    "datasets": {"geometry", "_support"},
     "metrics": GROUND | {"datasets"},
     "init_points": GROUND | {"datasets"},
     "fit": GROUND | {"losses", "datasets", "metrics", "init_points"},
@@ -32,7 +33,8 @@ MAY_IMPORT = {  # a room, and the others that it may import
     "app": LIBRARY,  # which prints, locks and publishes: no other room but the study knows it
     "study": LIBRARY | {"app"},  # which no other room knows
 }
-BELOW_SCENES = {"kgs.geometry"}  # the core that datasets may import
+SENSORS = "kgs.geometry.camera_models"  # Kornia promises nothing of `kornia.sensors`
+PINHOLE = "kornia.geometry.camera.PinholeCamera"
 HEAVY = ("cv2", "PIL", "trimesh", "matplotlib", "tqdm", "tyro", "numba", "pycolmap", "pandas", "scipy", "distributed")
 
 
@@ -121,13 +123,14 @@ def test_no_folders_import_each_other(folder):
 def test_imports_go_one_way():
     wrong = [pair for pair in pairs() if room(pair[1]) not in MAY_IMPORT[room(pair[0])] | {room(pair[0])}]
     assert not wrong
-    core_of_scenes = {other for name, other in pairs() if room(name) == "datasets" and room(other) == "core"}
-    assert core_of_scenes <= BELOW_SCENES
 
 
-def test_drop_imports_only_torch_and_the_reference_nothing_of_the_fast_path():
+def test_what_single_files_may_import():
     assert {name.split(".")[0] for name in imports("kgs.drop")} - set(sys.stdlib_module_names) == {"torch"}
-    assert imported_modules("kgs.reference") <= {"kgs.types"}
+    assert [name for name in SOURCES if any(within(other, "kornia.sensors") for other in imports(name))] == [SENSORS]
+    support = {"kgs._support.checks", "kgs._support.default_device"}
+    assert imported_modules("kgs.reference") == {*support, "kgs.geometry.types"}
+    assert {name for name in imports("kgs.reference") if name.startswith("kornia")} == {PINHOLE}
 
 
 def test_what_is_imported_is_light():
@@ -158,6 +161,30 @@ print(kgs._support.machine.peak_rss_mb())
     assert [name for name in new if within(name, *HEAVY, *above)] == []
     assert by_a_fit == "slow:"  # of photos: packages that it does not call
     assert memory == "0"  # Windows has no `resource`: the memory of a fit is not known where nothing tells it
+
+
+# -- values --------------------------------------------------------------------------------------------------------
+
+
+def dataclasses_of(name):
+    """The dataclasses of a module: name, whether `==` is identity, and the words of its fields' types."""
+    for node in nodes(name):
+        if not isinstance(node, ast.ClassDef):
+            continue
+        decorator = next((ast.unparse(each) for each in node.decorator_list if "dataclass" in ast.unparse(each)), "")
+        types = [ast.unparse(field.annotation) for field in node.body if isinstance(field, ast.AnnAssign)]
+        if decorator:
+            words_of = {word for text in types if "Callable" not in text for word in re.findall(r"\w+", text)}
+            yield node.name, "eq=False" in decorator, words_of
+
+
+def test_a_value_that_holds_tensors_is_equal_to_itself_alone():
+    """`==` of a generated `__eq__` would ask whether a tensor is true, which is an error."""
+    known = [(module, *found) for module in SOURCES for found in dataclasses_of(module)]
+    held = {"Tensor", "NDArray", "Array", "PinholeCamera", "GaussianModel"}
+    for _ in range(4):  # as deep as values hold values
+        held |= {name for _, name, _, types in known if types & held}
+    assert not [(module, name) for module, name, by_identity, types in known if types & held and not by_identity]
 
 
 # -- errors --------------------------------------------------------------------------------------------------------

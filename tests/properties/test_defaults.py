@@ -91,7 +91,7 @@ def test_renders_are_on_the_device_and_in_the_dtype_of_their_inputs(name):
     assert_unchanged(RENDERS[name], other_defaults())
 
 
-def test_the_reference_scenes_and_fits_are_the_same_under_another_dtype(scene, points, tmp_path):
+def test_the_reference_scenes_and_fits_are_the_same_under_other_defaults(scene, points, tmp_path):
     trimesh.PointCloud(points.points.numpy()).export(tmp_path / "cloud.ply")
     makers = {
         "reference": lambda: kgs.reference.render(GAUSSIANS, CAMERA),
@@ -101,7 +101,7 @@ def test_the_reference_scenes_and_fits_are_the_same_under_another_dtype(scene, p
         "Trainer": lambda: trained(scene, points),
     }
     for make in makers.values():
-        assert_unchanged(make, other_defaults(device=None))
+        assert_unchanged(make, other_defaults())
 
 
 def test_a_scene_keeps_no_texture_of_the_defaults_it_was_made_under():

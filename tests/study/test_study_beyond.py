@@ -9,9 +9,10 @@ import torch
 from init_point_scenes import as_views
 
 from kgs.datasets import synthetic_scene
-from kgs.datasets.scene import Scene, pinholes
+from kgs.datasets.scene import Scene
 from kgs.datasets.synthetic import room, synthetic_depths, views_beyond
-from kgs.geometry import camera_centers
+from kgs.geometry.cameras import pinhole_cameras
+from kgs.geometry.rigs import camera_centers
 from kgs.study import beyond
 from kgs.study.beyond import Target, beyond_cells, from_the_middle, measure_target, room_targets
 from kgs.study.beyond_report import write_beyond
@@ -66,7 +67,7 @@ def test_the_truth_has_no_finite_psnr(targets):
 
 
 def test_only_pixels_that_count_are_compared():
-    camera = pinholes(torch.eye(4)[None], torch.eye(4)[None], (2, 3))
+    camera = pinhole_cameras(torch.eye(4), torch.eye(4), 3, 2)
     views = as_views(camera, torch.full((1, 3, 2, 3), 0.5))
     shown = torch.tensor([[True, True, False], [False, False, False]])
     image = torch.full((1, 3, 2, 3), 0.9)
@@ -84,7 +85,7 @@ def scene_along(x, photos, **changes):
     extrinsics = torch.eye(4).repeat(len(photos), 1, 1)
     extrinsics[:, 0, 3] = -torch.tensor(x)
     intrinsics = torch.eye(4).repeat(len(photos), 1, 1)
-    views = as_views(pinholes(intrinsics, extrinsics, tuple(photos.shape[-2:])), photos)
+    views = as_views(pinhole_cameras(extrinsics, intrinsics, photos.shape[-1], photos.shape[-2]), photos)
     none = torch.zeros(0, 3)
     return Scene(
         views, views.select([]), none, none, "none", torch.zeros(3), torch.zeros(3), Path(), train_full_size=views

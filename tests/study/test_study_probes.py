@@ -10,7 +10,7 @@ from kgs.datasets import synthetic_scene
 from kgs.fit.config import FitConfig
 from kgs.fit.plan import make_plan
 from kgs.fit.trainer import Trainer
-from kgs.harmonics import SH_C0
+from kgs.geometry.harmonics import SH_C0
 from kgs.init_points import initial_points
 from kgs.model import GaussianModel
 from kgs.renderer import GaussianRenderer

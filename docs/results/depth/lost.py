@@ -14,7 +14,8 @@ from kgs.bench.scenes import check_scenes
 from kgs.datasets import load_scene
 from kgs.fit.config import FitConfig
 from kgs.fit.run import fit_scene
-from kgs.geometry import ViewGeometry, nearest_pixels
+from kgs.geometry.cameras import project, to
+from kgs.geometry.multiview import nearest_pixels, unproject
 from kgs.init_points.agreement import consistent_pixels
 from kgs.init_points.dense import agreed_depths
 
@@ -54,18 +55,18 @@ def lost(*, out: Path, seed: int = 0) -> None:
 def _rows(data: Path, name: str, seed: int) -> list[Row]:
     scene = load_scene(data / name, VIEWS, DOWNSCALE)
     everything = load_scene(data / name, None, DOWNSCALE, hold_out=0).train
-    geometry = ViewGeometry.of(scene.train.cameras)
+    cameras = to(scene.train.cameras, "cpu", torch.float64)
     near, far = depth_range(scene.train)
     maps, certain = agreed_depths(scene.train, near, far)
     of_points = [
-        torch.where(consistent_pixels(geometry, maps, certain, view), maps[view].depths, 0.0) for view in range(VIEWS)
+        torch.where(consistent_pixels(cameras, maps, certain, view), maps[view].depths, 0.0) for view in range(VIEWS)
     ]
     true = confirmed_depths(everything, near, far, list(range(len(everything))))
     of_name = dict(zip(everything.names, true, strict=True))
     of_photos = [of_name[photo] for photo in scene.train.names]
     kinds = torch.stack(
         [
-            _kinds(scene.test.cameras, view, of_name[photo], geometry, of_points, of_photos)
+            _kinds(scene.test.cameras, view, of_name[photo], cameras, of_points, of_photos)
             for view, photo in enumerate(scene.test.names)
         ]
     )
@@ -86,7 +87,7 @@ def _kinds(
     cameras: PinholeCamera,
     view: int,
     depths: Tensor,
-    training: ViewGeometry,
+    training: PinholeCamera,
     of_points: list[Tensor],
     true: list[Tensor],
 ) -> Tensor:
@@ -102,9 +103,11 @@ def _kinds(
     """
     kinds = torch.zeros(depths.shape, dtype=torch.long)
     rows, columns = (depths > 0).nonzero().unbind(1)
-    own = ViewGeometry.of(cameras)
-    points = own.unproject(torch.stack([columns, rows], 1), depths[rows, columns].double(), torch.full_like(rows, view))
-    pixels, there = training.project(points)
+    own = to(cameras, "cpu", torch.float64)
+    points = unproject(
+        own, torch.stack([columns, rows], 1), depths[rows, columns].double(), torch.full_like(rows, view)
+    )
+    pixels, there = project(training, points)
     seen = torch.zeros(len(points), dtype=torch.long)
     agreed = torch.zeros(len(points), dtype=torch.bool)
     right = agreed.clone()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 import tyro
+from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs.bench.output import Row, markdown_table, write_results
@@ -14,7 +15,9 @@ from kgs.bench.scenes import check_scenes
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths
-from kgs.geometry import ViewGeometry
+from kgs.geometry.cameras import project, to
+from kgs.geometry.multiview import unproject
+from kgs.geometry.rigs import camera_centers
 from kgs.init_points.agreement import confirming_views, consistent_pixels
 from kgs.init_points.dense import agreed_depths, small_enough
 from kgs.init_points.depth_limits import certain_points, sweep_range
@@ -101,15 +104,15 @@ def _known(data: Path, name: str, size: str, folder: Path | None) -> Truth:
 
 def depth_range(views: Views) -> tuple[float, float]:
     """The depths between which views are swept, by points that are certain."""
-    geometry = ViewGeometry.of(views.cameras)
-    return sweep_range(certain_points(views, geometry), geometry)
+    cameras = to(views.cameras, "cpu", torch.float64)
+    return sweep_range(certain_points(views, cameras), cameras)
 
 
 def confirmed_depths(views: Views, near: float, far: float, chosen: list[int]) -> Tensor:
     """Depths `(V, H, W)` of the chosen views where enough other views confirm them, else 0."""
-    geometry = ViewGeometry.of(views.cameras)
+    cameras = to(views.cameras, "cpu", torch.float64)
     maps, certain = agreed_depths(views, near, far)
-    confirmed = [confirming_views(geometry, maps, certain, view) >= CONFIRMED for view in chosen]
+    confirmed = [confirming_views(cameras, maps, certain, view) >= CONFIRMED for view in chosen]
     depths = [torch.where(mask, maps[view].depths, 0.0) for view, mask in zip(chosen, confirmed, strict=True)]
     return torch.stack(depths).double()
 
@@ -117,15 +120,15 @@ def confirmed_depths(views: Views, near: float, far: float, chosen: list[int]) -
 def _row(known: Truth) -> Row:
     """Shares of agreed pixels that are wrong, and of pixels of known depth that are agreed and right."""
     begin = time.perf_counter()
-    geometry = ViewGeometry.of(known.views.cameras)
+    cameras = to(known.views.cameras, "cpu", torch.float64)
     maps, certain = agreed_depths(known.views, known.near, known.far)
-    agreed = torch.stack([consistent_pixels(geometry, maps, certain, view) for view in range(len(maps))])
+    agreed = torch.stack([consistent_pixels(cameras, maps, certain, view) for view in range(len(maps))])
     seconds = time.perf_counter() - begin
     depths = torch.stack([depth_map.depths for depth_map in maps]).double()
     is_known = known.depths > 0
     judged = agreed & is_known
     off = {f"{share:.0%}": (depths / known.depths - 1).abs() > share for share in SHARES}
-    moved = torch.stack([_displacements(geometry, view, depths[view], known.depths[view]) for view in range(len(maps))])
+    moved = torch.stack([_displacements(cameras, view, depths[view], known.depths[view]) for view in range(len(maps))])
     off |= {f"{pixels:g} px": ~(moved <= pixels) for pixels in PIXELS}
     row: Row = {"views": len(maps), "height": depths.shape[1], "width": depths.shape[2], "seconds": round(seconds, 1)}
     row["agreed"] = _share(agreed)
@@ -137,16 +140,17 @@ def _share(mask: Tensor) -> float:
     return round(float(mask.double().mean()), 4)
 
 
-def _displacements(geometry: ViewGeometry, view: int, depths: Tensor, truth: Tensor) -> Tensor:
+def _displacements(cameras: PinholeCamera, view: int, depths: Tensor, truth: Tensor) -> Tensor:
     """By how many pixels a view's pixels at some depths lie beside the true ones in the nearest view, `(H, W)`."""
-    distances = (geometry.centers - geometry.centers[view]).norm(dim=1)
+    centers = camera_centers(cameras.extrinsics)
+    distances = (centers - centers[view]).norm(dim=1)
     distances[view] = torch.inf
     nearest = int(distances.argmin())
     rows, columns = torch.meshgrid(*map(torch.arange, depths.shape), indexing="ij")
     pixels = torch.stack([columns, rows], -1).reshape(-1, 2)
     of_view = torch.full((len(pixels),), view)
     pixels = [
-        geometry.project(geometry.unproject(pixels, values.reshape(-1), of_view))[0][:, nearest]
+        project(cameras, unproject(cameras, pixels, values.reshape(-1), of_view))[0][:, nearest]
         for values in (depths, truth)
     ]
     return (pixels[0] - pixels[1]).norm(dim=1).reshape(depths.shape)

@@ -16,7 +16,8 @@ from kgs.bench.scenes import check_scenes
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths
-from kgs.geometry import camera_centers, project_points
+from kgs.geometry.cameras import project
+from kgs.geometry.rigs import camera_centers
 from kgs.init_points import initial_points
 
 ALL_POINTS, RANDOM_POINTS = 10**6, 10_000
@@ -136,7 +137,7 @@ def complete_pixels(points: Tensor, views: Views, truth: Tensor) -> Tensor:
     found = torch.zeros_like(truth, dtype=torch.bool)
     limits = torch.tensor([truth.shape[2], truth.shape[1]])
     for view, exact in enumerate(truth):
-        pixels, depths = (part[:, 0] for part in project_points(points, views.camera(view)))
+        pixels, depths = (part[:, 0] for part in project(views.camera(view), points))
         for offset in product(range(-REACH, REACH + 1), repeat=2):
             near = pixels.round() + torch.tensor(offset)
             inside = ((near >= 0) & (near < limits)).all(1) & ((near - pixels).norm(dim=1) <= REACH)
@@ -148,7 +149,7 @@ def complete_pixels(points: Tensor, views: Views, truth: Tensor) -> Tensor:
 
 def _view_errors(points: Tensor, views: Views, truth: Tensor, view: int) -> Tensor:
     """Depth over the surface's depth less 1 in one view, `(P,)`; NaN where the point is not in its image."""
-    pixels, depths = (part[:, 0] for part in project_points(points, views.camera(view)))
+    pixels, depths = (part[:, 0] for part in project(views.camera(view), points))
     inverse = torch.where(truth[view] > 0, 1 / truth[view], 0.0)
     height, width = inverse.shape
     limits = torch.tensor([width, height]) - 0.5

@@ -67,9 +67,9 @@ def load_splat(ply: Path, scene: "Scene", device: "torch.device", backend: str) 
     A DataError if there is no Gaussian, or no camera of the scene sees one; single cameras that see none are named.
     """
     from kgs.fit.fit import Fit
-    from kgs.geometry import typical_depths
+    from kgs.geometry.multiview import typical_depths
+    from kgs.geometry.types import RasterOptions
     from kgs.ply import load_ply
-    from kgs.types import RasterOptions
 
     model = load_ply(ply, origin=scene.offset)
     if not len(model):
@@ -85,7 +85,7 @@ def _check_seen(ply: Path, fit: "Fit") -> None:
     """Refuse a splat that no camera sees; name the cameras that see nothing of it."""
     import torch
 
-    from kgs.camera import move_camera
+    from kgs.geometry.cameras import to
     from kgs.stages import project
 
     views = fit.scene.train
@@ -93,7 +93,7 @@ def _check_seen(ply: Path, fit: "Fit") -> None:
     with torch.no_grad():
         gaussians = fit.model()
     for i, name in enumerate(views.names):
-        camera = move_camera(views.camera(i), fit.device)
+        camera = to(views.camera(i), fit.device)
         if not len(project(gaussians, camera, options=fit.options, colors=False, backend=fit.backend)):
             blind.append(name)
     if len(blind) == len(views):

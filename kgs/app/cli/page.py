@@ -111,11 +111,10 @@ def page(
 
 def in_frame_of(scene: "Scene", again: "Scene") -> "Views":
     """Training views of a scene that was loaded again, with cameras in the frame of `scene`, whose offset differs."""
-    from kgs.datasets.scene import pinholes
+    from kgs.geometry.cameras import posed
 
     views = again.train
     extrinsics = views.cameras.extrinsics.double()
     shift = (scene.offset - again.offset).to(extrinsics)
     extrinsics[:, :3, 3] += extrinsics[:, :3, :3] @ shift
-    height, width = views.images.shape[-2:]
-    return replace(views, cameras=pinholes(views.cameras.intrinsics, extrinsics.float(), (height, width)))
+    return replace(views, cameras=posed(views.cameras, extrinsics.float()))

@@ -67,7 +67,7 @@ def _write_renders(folder: Path, fit: "Fit", is_transparent: bool) -> None:
 
     from kgs.app.files.cameras import as_taken
     from kgs.app.files.outputs import png_names, write_png
-    from kgs.camera import move_camera
+    from kgs.geometry.cameras import to
     from kgs.renderer import GaussianRenderer
 
     views = fit.scene.train
@@ -77,7 +77,7 @@ def _write_renders(folder: Path, fit: "Fit", is_transparent: bool) -> None:
     names = png_names(views.names)
     with torch.no_grad():
         for i, name in each(list(enumerate(views.names)), "pictures", "view"):
-            rendering = renderer(fit.model(), move_camera(views.camera(i), fit.device), color, outputs)
+            rendering = renderer(fit.model(), to(views.camera(i), fit.device), color, outputs)
             image = rendering.image
             if is_transparent:  # PNG's colours are not multiplied by alpha
                 image = torch.cat([image / rendering.alpha.clamp_min(1e-6), rendering.alpha], 1)

@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kgs.datasets.scene import Views, pinholes
-from kgs.geometry import common_up
+from kgs.datasets.scene import Views
+from kgs.geometry.cameras import posed, turned
+from kgs.geometry.rigs import common_up
 
 _OUTSIDE = 0.01  # share of the Gaussians that the bounds leave out at each side of each axis
 _DISTANT = 10.0  # times the median distance from the middle: Gaussians beyond are a sky, outside the bounds
@@ -81,32 +82,22 @@ def rolled(views: Views, degrees: float) -> Views:
     """
     if not degrees or not len(views):
         return views
-    angle = math.radians(degrees)
     quarters = round(degrees / 90)
-    turn = torch.eye(4, dtype=torch.float64)
-    turn[:2, :2] = torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-    cameras = views.cameras
-    poses = turn.to(cameras.extrinsics) @ cameras.extrinsics
-    lenses = cameras.intrinsics.clone()
-    height, width = views.images.shape[-2:]
-    for _ in range(quarters % 4):  # x' = H - 1 - y, y' = x
-        before = lenses.clone()
-        lenses[:, 0, 0] = before[:, 1, 1]
-        lenses[:, 1, 1] = before[:, 0, 0]
-        lenses[:, 0, 2] = height - 1 - before[:, 1, 2]
-        lenses[:, 1, 2] = before[:, 0, 2]
-        height, width = width, height
+    angle = math.radians(degrees - 90 * quarters)
+    roll = torch.eye(4, dtype=torch.float64)
+    roll[:2, :2] = torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    poses = roll.to(views.cameras.extrinsics) @ views.cameras.extrinsics
 
-    def turned(image: Tensor) -> Tensor:
+    def rotated(image: Tensor) -> Tensor:
         return torch.rot90(image, -quarters, (-2, -1))
 
     return replace(
         views,
-        cameras=pinholes(lenses, poses, (height, width)),
-        images=turned(views.images),
-        alphas=None if views.alphas is None else turned(views.alphas),
-        border_mask=None if views.border_mask is None else turned(views.border_mask),
-        valid_mask=None if views.valid_mask is None else turned(views.valid_mask),
+        cameras=turned(posed(views.cameras, poses), quarters),
+        images=rotated(views.images),
+        alphas=None if views.alphas is None else rotated(views.alphas),
+        border_mask=None if views.border_mask is None else rotated(views.border_mask),
+        valid_mask=None if views.valid_mask is None else rotated(views.valid_mask),
     )
 
 

@@ -14,9 +14,9 @@ from kgs.app.files.film import path_near_plane, write_film
 from kgs.app.files.glb import save_glb
 from kgs.app.files.preview import write_preview
 from kgs.compressed_ply import save_compressed_ply
-from kgs.datasets.scene import pinholes
 from kgs.fit.fit import Fit
-from kgs.geometry import typical_depths
+from kgs.geometry.cameras import posed
+from kgs.geometry.multiview import typical_depths
 from kgs.ply import float32_moves
 
 
@@ -33,8 +33,7 @@ def write_exports(fit: Fit, folder: Path, roll: float = 0.0) -> list[str]:
     near_plane = path_near_plane(fit.model.means, scene.train.cameras, fit.options.near_plane)
     film_fit = replace(fit, options=replace(fit.options, near_plane=near_plane))
     frames = rolled(scene.train, roll)
-    height, width = frames.images.shape[-2:]
-    frames = replace(frames, cameras=pinholes(frames.cameras.intrinsics, poses, (height, width)))
+    frames = replace(frames, cameras=posed(frames.cameras, poses))
     write_preview(folder / "preview.jpg", film_fit.render, frames)
     why = write_film(folder / f"turntable{film_suffix()}", film_fit.render, frames, depth, each)
     return [why] if why else []

@@ -14,8 +14,10 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from kgs._support.progress import ProgressBar, silent
-from kgs.datasets.scene import Views, pinholes
-from kgs.geometry import camera_centers, meeting_point, typical_depths
+from kgs.datasets.scene import Views
+from kgs.geometry.cameras import image_size, pinhole_cameras, posed, resized
+from kgs.geometry.multiview import typical_depths
+from kgs.geometry.rigs import camera_centers, meeting_point
 
 from .cameras import upright
 from .encoders import encode
@@ -55,12 +57,12 @@ def write_film(
         "", or the reason why no film was written: there is no encoder for it here.
     """
     path = Path(path)
-    size, lens = _frame_lens(views)
-    poses = resample_by_speed(views.cameras.extrinsics, FRAMES, depth).to(lens)
+    camera = _frame_camera(views)
+    poses = resample_by_speed(views.cameras.extrinsics, FRAMES, depth).to(camera.extrinsics)
     part = path.with_name(f".{path.name}")  # OpenCV chooses the format by the suffix
-    cameras = (pinholes(lens[None], pose[None], size) for pose in bar(list(poses), "film", "frame"))
+    frames = (posed(camera, pose[None]) for pose in bar(list(poses), "film", "frame"))
     try:
-        if why := encode(part, (eight_bits(render(camera)[0]) for camera in cameras), size[::-1]):
+        if why := encode(part, (eight_bits(render(frame)[0]) for frame in frames), image_size(camera)[::-1]):
             return f"no {path.name}: {why}"
         os.replace(part, path)
     except OSError as error:
@@ -84,16 +86,13 @@ def path_near_plane(means: Tensor, cameras: PinholeCamera, near_plane: float) ->
     return max(near_plane, _CLEAR * typical_depths(means, cameras)[0])
 
 
-def _frame_lens(views: Views) -> tuple[tuple[int, int], Tensor]:
-    """Height and width of the frames, and the mean intrinsics of the views for this size, `(4, 4)`."""
+def _frame_camera(views: Views) -> PinholeCamera:
+    """A camera of the frames' size, with the mean intrinsics of the views."""
     height, width = views.images.shape[-2:]
     shrink = min(1.0, LONGEST / max(height, width))
     size = (max(2, 2 * round(height * shrink / 2)), max(2, 2 * round(width * shrink / 2)))
-    scale = views.cameras.intrinsics.new_tensor([size[1] / width, size[0] / height])
-    lens = views.cameras.intrinsics.mean(0)
-    lens[:2] *= scale[:, None]
-    lens[:2, 2] += (scale - 1) / 2  # (c + 1/2) s - 1/2: pixel centres are integers
-    return size, lens
+    camera = pinhole_cameras(views.cameras.extrinsics[:1], views.cameras.intrinsics.mean(0), width, height)
+    return resized(camera, (size[1] / width, size[0] / height), size)
 
 
 def resample_by_speed(extrinsics: Tensor, frames: int, depth: float) -> Tensor:

@@ -12,17 +12,18 @@ from typing import Any
 
 import numpy as np
 import torch
+from kornia.color import rgb_to_linear_rgb
 from kornia.geometry.conversions import rotation_matrix_to_quaternion
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kgs._support.checks import check_kind
 from kgs._support.errors import ArgumentError
 from kgs._support.json_files import write_whole
 from kgs._support.version import __version__
-from kgs.harmonics import SH_C0
+from kgs.geometry.harmonics import SH_C0
 from kgs.model import GaussianModel
 from kgs.ply import as_vector
-from kgs.types import check_kind
 
 _EXTENSION = "KHR_gaussian_splatting"
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}  # types of accessors, by the count of numbers per Gaussian
@@ -157,7 +158,8 @@ def _unit_quaternions(quats: Tensor) -> Tensor:
 def _linear_colors(harmonics: Tensor) -> Tensor:
     """The colours of degree 0 as linear RGB, which COLOR_0 requires, `(N, 3)` float64; the model's are sRGB."""
     srgb = (SH_C0 * harmonics[:, 0].double() + 0.5).clamp(0, 1)
-    return torch.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    linear: Tensor = rgb_to_linear_rgb(srgb.T[..., None])[..., 0].T
+    return linear
 
 
 def _chunk(kind: bytes, content: bytes) -> bytes:

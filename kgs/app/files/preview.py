@@ -8,8 +8,9 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs._support.json_files import write_whole
-from kgs.datasets.scene import Views, pinholes
-from kgs.geometry import camera_centers
+from kgs.datasets.scene import Views
+from kgs.geometry.cameras import resized
+from kgs.geometry.rigs import camera_centers
 
 from .images import eight_bits
 
@@ -32,10 +33,7 @@ def write_preview(path: Path, render: Callable[[PinholeCamera], Tensor], views: 
     nearest = int((centers - centers.mean(0)).norm(dim=1).argmin())
     height, width = views.images.shape[-2:]
     scale = max(WIDTH / width, HEIGHT / height)
-    lens = views.cameras.intrinsics[nearest : nearest + 1].clone()
-    lens[:, :2, :3] *= scale
-    lens[:, 0, 2] += (scale - 1) / 2 - (scale * width - WIDTH) / 2  # (c + 1/2) s - 1/2: pixel centres are integers
-    lens[:, 1, 2] += (scale - 1) / 2 - (scale * height - HEIGHT) / 2
-    image = render(pinholes(lens, views.cameras.extrinsics[nearest : nearest + 1], (HEIGHT, WIDTH)))
+    middle = (scale * width - WIDTH) / 2, (scale * height - HEIGHT) / 2
+    image = render(resized(views.camera(nearest), scale, (HEIGHT, WIDTH), middle))
     _, content = cv2.imencode(".jpg", eight_bits(image[0]), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     write_whole(path, content.tobytes())

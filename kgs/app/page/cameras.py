@@ -12,7 +12,9 @@ from torch import Tensor
 
 from kgs.app.files.encoders import RATE
 from kgs.app.files.film import FRAMES, resample_by_speed
-from kgs.geometry import camera_centers, common_up, typical_depths
+from kgs.geometry.cameras import select, to, turned
+from kgs.geometry.multiview import points_in_images, typical_depths
+from kgs.geometry.rigs import camera_centers, common_up
 
 Array = NDArray[np.float64]
 _PYRAMID = 0.3  # depth of a pyramid, as a share of the median distance between neighbouring cameras
@@ -54,23 +56,26 @@ def viewer_scene(
         tour: the rotations and positions of the cameras of the film, see :func:`kgs.app.files.film.resample_by_speed`
             (poses), and its length (seconds).
     """
+    cameras = to(cameras, "cpu", torch.float64)
     positions = camera_centers(cameras.extrinsics).numpy()
-    points = means.detach().cpu().double().numpy()
     entries = list[dict[str, Any]]()
     order = {name: number for number, name in enumerate(sorted(names), 1)}
-    for name, part, position, (k, pose, size) in zip(names, parts, positions, lenses(cameras), strict=True):
-        depths = visible_points(points, k, pose, size)[:, 2]
+    for i, (name, part, position) in enumerate(zip(names, parts, positions, strict=True)):
+        camera = select(cameras, i)
+        depths, inside = points_in_images(means.detach(), camera)
+        seen = depths[inside]
+        k = camera.intrinsics[0]
         entries.append(
             {
                 "name": name,
                 "part": part,
                 "label": f"photo {order[name]} of {len(order)}{', held out' if part == 'test' else ''}",
-                "size": size.tolist(),
+                "size": [int(camera.width), int(camera.height)],
                 "focal": k.diagonal()[:2].tolist(),
                 "centre": k[:2, 2].tolist(),
-                "rotation": pose[:3, :3].tolist(),
+                "rotation": camera.extrinsics[0, :3, :3].tolist(),
                 "position": position.tolist(),
-                "distance": float(np.median(depths)) if len(depths) else 1.0,
+                "distance": float(np.median(seen)) if len(seen) else 1.0,
             }
         )
     depth = float(np.median([camera["distance"] for camera in entries]))
@@ -87,7 +92,7 @@ def viewer_scene(
         "up": up.tolist(),
         "pyramid": _pyramid_depth(positions, depth),
         "arc": _arc(rotations, positions, first, distance, up.numpy()),
-        "turned": [_turned(cameras.extrinsics, quarters, positions, first, distance) for quarters in (1, 2, 3)],
+        "turned": [_turned(cameras, quarters, positions, first, distance) for quarters in (1, 2, 3)],
         "tour": _tour(training_cameras(cameras, parts), means),
     }
 
@@ -100,30 +105,7 @@ def are_training(parts: Sequence[str]) -> list[bool]:
 
 def training_cameras(cameras: PinholeCamera, parts: Sequence[str]) -> PinholeCamera:
     """Those of the training photos, on the CPU; see :func:`are_training`."""
-    rows = torch.tensor(are_training(parts))
-    values = (cameras.intrinsics, cameras.extrinsics, cameras.height, cameras.width)
-    return PinholeCamera(*(value.cpu()[rows] for value in values))
-
-
-def lenses(cameras: PinholeCamera) -> list[tuple[Array, Array, NDArray[np.intp]]]:
-    """Intrinsics, extrinsics (both `(4, 4)`), and width and height of each camera."""
-    k = cameras.intrinsics.detach().cpu().double().numpy()
-    poses = cameras.extrinsics.detach().cpu().double().numpy()
-    sizes = np.array([cameras.width.tolist(), cameras.height.tolist()], np.intp).T
-    return list(zip(k, poses, sizes, strict=True))
-
-
-def visible_points(points: Array, k: Array, pose: Array, size: NDArray[np.intp], near_plane: float = 0.0) -> Array:
-    """Those of the points `(N, 3)` that lie inside the image and beyond the near plane, in the camera's axes."""
-    turn = np.ascontiguousarray(pose[:3, :3].T)  # NumPy multiplies by a part of a matrix without BLAS: 100 times slower
-    in_camera = points @ turn + pose[:3, 3]
-    in_front = in_camera[in_camera[:, 2] > near_plane]
-    x, y, z = in_front.T
-    columns = x / z * k[0, 0] + k[0, 2]
-    rows = y / z * k[1, 1] + k[1, 2]
-    width, height = size - 0.5
-    inside: Array = in_front[(columns >= -0.5) & (columns <= width) & (rows >= -0.5) & (rows <= height)]
-    return inside
+    return to(select(cameras, np.flatnonzero(are_training(parts)).tolist()), "cpu")
 
 
 def _nearest_mean_pose(rotations: Array, positions: Array, training: Sequence[bool]) -> list[int]:
@@ -175,11 +157,9 @@ def _arc(rotations: Array, positions: Array, first: int, distance: float, up: Ar
     }
 
 
-def _turned(extrinsics: Tensor, quarters: int, positions: Array, first: int, distance: float) -> dict[str, Any]:
+def _turned(cameras: PinholeCamera, quarters: int, positions: Array, first: int, distance: float) -> dict[str, Any]:
     """What is up, and the arc of the cameras, where all pictures are turned clockwise by some quarters."""
-    poses = extrinsics.detach().double().cpu().clone()
-    for _ in range(quarters):
-        poses[:, :2] = torch.stack([-poses[:, 1], poses[:, 0]], 1)  # right and down
+    poses = turned(cameras, quarters).extrinsics
     up = common_up(poses)
     return {"up": up.tolist(), "arc": _arc(poses[:, :3, :3].numpy(), positions, first, distance, up.numpy())}
 

@@ -7,7 +7,7 @@ from typing import Any
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from kgs.types import Gaussians, RasterOptions
+from kgs.geometry.types import Gaussians, RasterOptions
 
 from .pictures import Picture
 

@@ -19,17 +19,20 @@ from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from kornia.geometry.camera import PinholeCamera
 from numpy.typing import NDArray
 from torch import Tensor
 
 from kgs._support.errors import ArgumentError, quantity
-from kgs.geometry import camera_centers
-from kgs.harmonics import SH_C0
-from kgs.projection import finite_gaussians
-from kgs.types import SH_SIZES, Gaussians, RasterOptions
+from kgs.geometry.cameras import project, select, to
+from kgs.geometry.harmonics import SH_C0
+from kgs.geometry.multiview import inside_images
+from kgs.geometry.projection import finite_gaussians
+from kgs.geometry.rigs import camera_centers
+from kgs.geometry.types import SH_SIZES, Gaussians, RasterOptions
 
-from .cameras import Array, lenses, visible_points
+from .cameras import Array
 
 PIXEL_ERROR = 0.01  # largest shift of a Gaussian's centre by rounding, in pixels of the given cameras
 FINE = 16  # bits per number
@@ -261,11 +264,16 @@ def _spread_out(name: str, values: Array, bits: int) -> Column:
 def _pixels_per_unit(means: Array, cameras: PinholeCamera, near_plane: float) -> float:
     """The largest shift of a centre in an image that shows it, in pixels, when it moves by one world unit."""
     maximum = 0.0
-    for k, pose, size in lenses(cameras):
-        points = visible_points(means, k, pose, size, near_plane)
-        tangents = points[:, :2] / points[:, 2:]
-        shifts = np.abs(k.diagonal()[:2]).max() / points[:, 2] * np.sqrt(1 + (tangents**2).sum(axis=1))
-        maximum = max(maximum, float(shifts.max(initial=0.0)))
+    points = torch.from_numpy(means)
+    for i in range(cameras.batch_size):
+        camera = to(select(cameras, i), "cpu", torch.float64)
+        pixels, depths = project(camera, points)
+        seen = inside_images(camera, pixels, depths, near_plane)[:, 0]
+        if seen.any():
+            k = camera.intrinsics[0]
+            tangents = (pixels[seen, 0] - k[:2, 2]) / k.diagonal()[:2]
+            shifts = k.diagonal()[:2].abs().max() / depths[seen, 0] * (1 + tangents.square().sum(1)).sqrt()
+            maximum = max(maximum, float(shifts.max()))
     return maximum
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from kgs._support.errors import DataError
@@ -25,6 +24,7 @@ from kgs.fit.decisions import Decisions
 from kgs.fit.fit import Fit
 from kgs.fit.measures import used_init
 from kgs.fit.pruning import contributions, left_out
+from kgs.geometry.cameras import joined
 
 from .content import PageContent, PagePhotos, PageSplat, PageText
 from .figures import psnr_of_views
@@ -164,7 +164,7 @@ def _photos(scene: Scene, words: tuple[str, str], roll: float) -> PagePhotos:
     """The photos of a scene, none of which is shown."""
     training_word, test_word = words
     return PagePhotos(
-        cameras=_all_cameras(*shown(scene.train, roll), *shown(scene.test, roll)),
+        cameras=joined(*(views.cameras for views in (*shown(scene.train, roll), *shown(scene.test, roll)))),
         names=[*scene.train.names, *scene.test.names],
         parts=[training_word] * len(scene.train) + [test_word] * len(scene.test),
     )
@@ -311,12 +311,6 @@ def _finer_note(scene: Scene, request: SceneRequest) -> list[str]:
     side = max(scene.train.images.shape[-2:])
     words = f"The photos were fitted with {side} pixels on their longer side; kgs fit --detail high takes {full_side}."
     return [words] if full_side else []
-
-
-def _all_cameras(*parts: Views) -> PinholeCamera:
-    """The cameras of several sets of views in one batch."""
-    names = ("intrinsics", "extrinsics", "height", "width")
-    return PinholeCamera(*(torch.cat([getattr(views.cameras, name) for views in parts]) for name in names))
 
 
 def spread(count: int, max_count: int) -> list[int]:

@@ -265,7 +265,7 @@ class SplatRenderer {
   }
 
   // Smallest and largest x/z and y/z at which footprints are linearised: those of the photo's frame and a margin around
-  // it, as in kgs/camera.py. They do not depend on the shape of the canvas.
+  // it, as in kgs/geometry/lenses.py. They do not depend on the shape of the canvas.
   tangentLimits({ size, focal, centre }) {
     const { margin } = this.settings;
     return [

@@ -12,8 +12,8 @@ from kgs._support.json_files import write_whole
 from kgs._support.version import __version__
 from kgs.app.files.film import path_near_plane
 from kgs.app.files.plot import psnr_plot
-from kgs.camera import MARGIN
-from kgs.types import RasterOptions
+from kgs.geometry.lenses import MARGIN
+from kgs.geometry.types import RasterOptions
 
 from .cameras import training_cameras, viewer_scene
 from .content import PageContent, PagePhotos, PageSplat, PageText

@@ -20,7 +20,7 @@ import torch
 
 from kgs._support.errors import PhotosRefused
 from kgs._support.progress import ProgressBar
-from kgs.geometry import degrees_between
+from kgs.geometry.rigs import degrees_between
 
 from .find import MIN_PHOTOS
 from .map import Cameras, Solver
@@ -144,7 +144,7 @@ def say_left_out(rejected: Mapping[str, str], say: Callable[[str], None]) -> Non
 
 @dataclass(frozen=True)
 class Consensus:
-    """Two solvers of the same photos; the second one works in the executor's only thread."""
+    """Two solvers of the same photos, at work at the same time: the second one in the executor's only thread."""
 
     solvers: tuple[Solver, Solver]
     second_matches: "Future[None]"
@@ -153,7 +153,7 @@ class Consensus:
     pairs: Pairs
 
     def solve(self, names: Mapping[str, str]) -> tuple[Solutions, list[float]]:
-        """What each solver finds, and the focal lengths of the Exif if the photos do not tell them, else [].
+        """What each solver finds, and the focal lengths of the Exif where only these tell them, else [].
 
         Args:
             names: those of the photos to register, by those of their images.
@@ -219,7 +219,7 @@ def retry(
         solver: whose tries they are.
         names: as `focals`, see :meth:`kgs.app.sfm.map.Solver.solve`.
         focals: the focal length of each lens in pixels if they are known; (): they are adjusted.
-        found: what the solver found.
+        found: what it found.
         other: what the other solver found.
         photos: those that are to be registered again.
     """
@@ -229,13 +229,15 @@ def retry(
     tries = min(_MAX_TRIES, max(_MIN_TRIES, _REGISTRATIONS // len(names)))
     for attempt, pair in enumerate(_first_pairs(solver.database, names, photos)[:tries], 1):
         at_least = min(len(seen_well(best, all_photos)) + 1, len(names))
-        best = _better(best, solver.solve(names, focals, attempt=attempt, first_pair=pair, at_least=at_least))
+        again = solver.solve(names, focals, attempt=attempt, first_pair=pair, at_least=at_least)
+        best = max(best, again, key=_merit)
         if not is_whole and seen_well(best, all_photos) == all_photos:
             return best
     registered = (seen_well(best, all_photos) & seen_well(other, all_photos)) - photos
     if len(registered) >= 2:
         start = other._replace(rotations={name: other.rotations[name] for name in registered})
-        best = _better(best, solver.solve(names, focals, start=start, at_least=len(registered) + 1))
+        again = solver.solve(names, focals, start=start, at_least=len(registered) + 1)
+        best = max(best, again, key=_merit)
     return best
 
 
@@ -246,9 +248,9 @@ def _first_pairs(database: Path, names: Mapping[str, str], photos: Set[str]) -> 
     return sorted(own, key=lambda pair: -counts[pair])
 
 
-def _better(one: Cameras, other: Cameras) -> Cameras:
-    """Those with more photos that see enough points; of as many, those with more points; the first of equals."""
-    return max(one, other, key=lambda found: (len(seen_well(found, found.points)), sum(found.points.values())))
+def _merit(cameras: Cameras) -> tuple[int, int]:
+    """How many photos see enough points, and how many points all see."""
+    return len(seen_well(cameras, cameras.points)), sum(cameras.points.values())
 
 
 def seen_well(cameras: Cameras, names: Iterable[str]) -> set[str]:
@@ -257,13 +259,7 @@ def seen_well(cameras: Cameras, names: Iterable[str]) -> set[str]:
 
 
 def without_cameras(solutions: Solutions, names: Sequence[str], pairs: Pairs) -> dict[str, str]:
-    """Photos whose cameras cannot be trusted while those of at least `MIN_PHOTOS` others can, and why.
-
-    Args:
-        solutions: what two solvers found.
-        names: the names of the photos that they were given.
-        pairs: verified matches of each pair.
-    """
+    """Photos whose cameras cannot be trusted while those of at least `MIN_PHOTOS` others can, and why."""
     # without photos that were registered badly the solvers may agree about the others
     left = _registered_badly(*solutions, names, pairs) or _disputed(*solutions, names)
     return left if len(names) - len(left) >= MIN_PHOTOS else {}
@@ -276,7 +272,7 @@ def doubtful(solutions: Solutions, names: Sequence[str], pairs: Pairs) -> set[st
 
 
 def _registered_badly(first: Cameras, second: Cameras, names: Sequence[str], pairs: Pairs) -> dict[str, str]:
-    """The photos that a solver did not register, that see few points, or whose lens is disputed, and why."""
+    """The photos that a solver failed to register, that see few points, or whose lens is disputed, and why."""
     left = dict[str, str]()
     registered = [name for name in names if name in first.points and name in second.points]
     better = max((first, second), key=lambda found: _worst_seen(found, registered))
@@ -287,10 +283,11 @@ def _registered_badly(first: Cameras, second: Cameras, names: Sequence[str], pai
             left[name] = f"{who} of two solvers could place it{advice}"
         elif better.points[name] < MIN_POINTS:
             left[name] = f"only {better.points[name]} points are seen in it, fewer than {MIN_POINTS}{advice}"
-        elif (
-            first.focals[name] != first.focal and (ratio := _ratio(first.focals[name], second.focals[name])) > MAX_RATIO
-        ):
-            left[name] = f"two solvers differ by a factor of {ratio:.3g} about the focal length of its lens"
+        elif first.focals[name] != first.focal:  # another lens than that of most
+            ratio = first.focals[name] / second.focals[name]
+            if max(ratio, 1 / ratio) > MAX_RATIO:
+                factor = f"{max(ratio, 1 / ratio):.3g}"
+                left[name] = f"two solvers differ by a factor of {factor} about the focal length of its lens"
     return left
 
 
@@ -299,14 +296,10 @@ def _worst_seen(cameras: Cameras, names: Sequence[str]) -> tuple[int, int]:
     return len(seen_well(cameras, names)), min((cameras.points[name] for name in names), default=0)
 
 
-def _ratio(one: float, other: float) -> float:
-    return max(one / other, other / one)
-
-
 def _disputed(first: Cameras, second: Cameras, names: Sequence[str]) -> dict[str, str]:
-    """The photos without which both solvers agree about all pairs: at each turn that in most pairs they differ about.
+    """The photos about which solvers differ, one after the other: each time the one that most pairs are disputed with.
 
-    Fewer than three may be left.
+    About all pairs of the others they agree. Fewer than three of these may be left.
     """
     angles = {pair: angle_between(first, second, pair) for pair in combinations(names, 2)}
     left = dict[str, str]()
@@ -323,6 +316,11 @@ def angle_between(first: Cameras, second: Cameras, pair: tuple[str, str]) -> flo
     """The angle between two solvers' rotations from one camera to another, in degrees."""
     both = [cameras.rotations[pair[1]] @ cameras.rotations[pair[0]].T for cameras in (first, second)]
     return float(degrees_between(*map(torch.from_numpy, both)))
+
+
+def largest_difference(first: Cameras, second: Cameras, names: Sequence[str]) -> tuple[float, tuple[str, str]]:
+    """The largest angle between two solvers' rotations from one camera to another, in degrees, and that pair."""
+    return max((angle_between(first, second, pair), pair) for pair in combinations(sorted(names), 2))
 
 
 def check(
@@ -365,7 +363,7 @@ def check(
         refuse(f"{two_ways} only one could place {', '.join(missing)}, so that nothing confirms it", beside)
     if doubt := focal_doubt(solutions):
         refuse(doubt, _APART)
-    degrees, pair = max((angle_between(*solutions, pair), pair) for pair in combinations(sorted(names), 2))
+    degrees, pair = largest_difference(*solutions, names)
     if degrees > MAX_DEGREES:
         by = f"by {degrees:.3g} degrees; expected at most {MAX_DEGREES:g}"
         refuse(f"{two_ways} they disagree about {' and '.join(pair)} ({by})", beside)
@@ -376,13 +374,7 @@ def check(
 
 
 def objections(cameras: Cameras, names: Sequence[str], longest: int) -> list[str]:
-    """The reasons to refuse one solver's cameras, a sentence each; empty if there are none.
-
-    Args:
-        cameras: what the solver found.
-        names: the names of all photos.
-        longest: the longer side of the photos in pixels.
-    """
+    """The reasons to refuse one solver's cameras, a sentence each."""
     if not cameras.points:
         return ["no pair of photos gave a first guess of the cameras"]
     reasons = []
@@ -399,7 +391,7 @@ def objections(cameras: Cameras, names: Sequence[str], longest: int) -> list[str
 
 
 def focal_doubt(solutions: Sequence[Cameras]) -> str:
-    """Why neither solution determines the focal length; "" if one does."""
+    """Why the focal length is in doubt after all solutions, or ""."""
     rise = max(0.0, *(cameras.focal_rise for cameras in solutions))
     if rise >= MIN_RISE:
         return ""
@@ -407,7 +399,7 @@ def focal_doubt(solutions: Sequence[Cameras]) -> str:
 
 
 def focal_difference(solutions: Sequence[Cameras]) -> str:
-    """How far the solvers' focal lengths are apart, if that is too far; "" if it is not. Each lens counts."""
+    """How far the solvers' focal lengths are apart, if that is too far for one of the lenses, or ""."""
     registered = set[str].intersection(*(set(cameras.focals) for cameras in solutions))
     focals = [[cameras.focal for cameras in solutions]]
     focals += [[cameras.focals[name] for cameras in solutions] for name in registered]

@@ -51,7 +51,7 @@ NO_CAMERAS = Cameras({}, {}, {}, {}, None, 0.0)  # of a solver that registered n
 
 @contextmanager
 def quiet_pycolmap() -> Iterator[Any]:
-    """pycolmap, without its log and without its handler of SIGTERM."""
+    """The module pycolmap with a silent log, and with the handler of SIGTERM that was there before."""
     main = threading.current_thread() is threading.main_thread()
     before = signal.getsignal(signal.SIGTERM)
     import pycolmap
@@ -85,7 +85,7 @@ class Solver:
         start: Cameras | None = None,
         at_least: int = 0,
     ) -> Cameras:
-        """Cameras and points of as many photos as can be registered; none if no pair can be.
+        """Cameras and points of as many photos as can be registered: `NO_CAMERAS` if no pair can be.
 
         Lenses are held while photos are registered, because two photos do not determine them, and adjusted to all of
         them after that. This is repeated with the lenses that came out until they no longer change.
@@ -136,7 +136,7 @@ class Solver:
         return cameras_of(best, names, math.inf if is_held else _focal_rise(best, error))
 
     def _map(self, options: Any, free: bool) -> Any:
-        """The reconstruction of most photos with the lenses of the database; None if no pair can be registered.
+        """The reconstruction of most photos with the lenses of the database, or None.
 
         If `free`, the second attempt adjusts focal lengths while it registers photos.
         """
@@ -158,7 +158,7 @@ class Solver:
         return self._run_mapper(options, known)
 
     def _run_mapper(self, options: Any, start: str | Path = "") -> Any:
-        """The reconstruction with most registered photos; None if there is none. The mapper goes on from `start`."""
+        """The reconstruction with most registered photos, or None. The mapper goes on from `start`."""
         import pycolmap
 
         try:
@@ -209,7 +209,7 @@ def _mapper_options(images: list[str], seed: int) -> Any:
 
 
 def _reconstruction(file: Any, cameras: Cameras, names: Mapping[str, str]) -> Any:
-    """A reconstruction with these cameras and the keypoints of a database, without points."""
+    """A reconstruction with these cameras and the keypoints of a database; its points are still to be found."""
     import pycolmap
 
     scene = pycolmap.Reconstruction()
@@ -238,7 +238,7 @@ def _is_worse(scene: Any, best: Any) -> bool:
 
 
 def _adjust(reconstruction: Any, is_held: bool) -> tuple[Any, float]:
-    """Bundle adjustment with radial distortions that are usual or explain enough of the errors, else without any.
+    """Bundle adjustment with radial distortions that are usual or explain enough of the errors, else with 0.
 
     Photos that hardly determine the focal length trade it against a distortion that no camera has. If `is_held`, the
     focal lengths stay.

@@ -37,7 +37,7 @@ class PhotoKeypoints(NamedTuple):
 
 
 def find_keypoints(photo: Photo, max_count: int) -> PhotoKeypoints:
-    """The strongest SIFT keypoints of a photo where it is kept, up to `max_count`; nothing is random."""
+    """The strongest SIFT keypoints of a photo where it is kept, up to `max_count`."""
     factor = 2 if max(photo.size) < SMALL else 1
     keypoints = root_sift(photo.grey(), max_count, factor, photo.mask, contrastThreshold=_CONTRAST)
     pixels = (keypoints.pixels + 0.5).float()
@@ -124,7 +124,7 @@ def lenses_of(photos: list[Photo]) -> list[Any]:
 
 
 def _write_photos(file: Any, photos: list[Photo], names: list[str], lenses: list[Any]) -> list[int]:
-    """Write the lenses, and the photos; returns the photos' ids."""
+    """The ids of the photos, which are written with their lenses."""
     import pycolmap
 
     rig_ids = []

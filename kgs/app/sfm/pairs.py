@@ -102,7 +102,7 @@ def without_overlap(
 
 
 def why_no_cameras(names: Sequence[str], pairs: Pairs, geometries: Mapping[tuple[str, str], PairGeometry]) -> str:
-    """Why matches cannot give cameras, and what to photograph next, as the advice of an error; "" if they can.
+    """Why matches fail to give cameras, and what to photograph next, as the advice of an error, or "".
 
     Args:
         names: the names of all photos.
@@ -170,7 +170,7 @@ def weakest_link(names: Sequence[str], pairs: Pairs) -> tuple[str, str]:
 
 
 def gap(name: str, others: Sequence[str], pairs: Pairs) -> tuple[str, str]:
-    """The photos beside a gap: one that could not be registered, and that of the others with most matches.
+    """The photos beside a gap: one that is missing, and that of the others with most matches.
 
     `others` are in the order in which they were taken; where none matches, the one taken next to it counts.
     """

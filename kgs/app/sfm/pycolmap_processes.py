@@ -40,7 +40,7 @@ class PycolmapProcesses:
                 process.kill()
 
     def run(self, step: str, database: Path, **arguments: Any) -> None:
-        """Run one of the `STEPS` below, and wait for it; its arguments go there as JSON.
+        """Run one of the `STEPS` below, and wait for it. Its arguments go there as JSON.
 
         Raises:
             OSError: the disk is full.
@@ -68,7 +68,7 @@ class PycolmapProcesses:
 
 
 def check_space(folder: Path) -> None:
-    """Raise an OSError if 4 MiB cannot be written to the folder; the file is removed again."""
+    """Raise an OSError if 4 MiB, which are removed again, find no room in the folder."""
     probe = folder / "probe"
     try:
         with open(probe, "wb") as file:

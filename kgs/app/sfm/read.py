@@ -44,7 +44,7 @@ _BLURRED = 0.5  # a photo below this share of the median sharpness is blurred
 
 
 class Exif(NamedTuple):
-    """What a photo's Exif says about orientation and focal length; None where it says nothing.
+    """What a photo's Exif says about orientation and focal length. None stands for nothing.
 
     Sources: Exif 2.32 (CIPA DC-008, 4.6); CIPA DCG-001 for the length on 35 mm film, which compares diagonals.
     """
@@ -55,7 +55,7 @@ class Exif(NamedTuple):
 
     @classmethod
     def of(cls, tags: Mapping[int, Any]) -> Self:
-        """Read it from an image's tags; a damaged tag counts as missing."""
+        """Read it from an image's tags. A damaged tag counts as missing."""
         orientation = int(_number(tags, _ORIENTATION))
         film = _number(tags, _FOCAL_35)
         focal = _number(tags, _FOCAL)
@@ -71,7 +71,7 @@ class Exif(NamedTuple):
         return self.orientation > 4
 
     def focal_ratio(self, width: int, height: int) -> float | None:
-        """The focal length over the longer side of a photo of this shape; None if there is none that a lens has."""
+        """The focal length over the longer side of a photo of this shape, if a lens has it, or None."""
         stored = height if self.is_sideways else width
         over_film = (self.focal_35mm or 0.0) / FILM_DIAGONAL * math.hypot(width, height) / max(width, height)
         over_sensor = (self.focal_over_width or 0.0) * stored / max(width, height)
@@ -79,7 +79,7 @@ class Exif(NamedTuple):
 
 
 def _number(tags: Mapping[int, Any], tag: int) -> float:
-    """A tag's number, the first if there are several; 0 if there is none above 0."""
+    """A tag's number above 0, the first if there are several, or 0."""
     value = tags.get(tag)
     try:
         number = float(value[0] if isinstance(value, tuple) else value)  # type: ignore[arg-type]  # None is a TypeError
@@ -89,7 +89,7 @@ def _number(tags: Mapping[int, Any], tag: int) -> float:
 
 
 class OpenPhoto(NamedTuple):
-    """A photo whose file is read and not decoded yet."""
+    """A photo whose file is read, and decoded later."""
 
     path: Path
     sha256: str
@@ -119,7 +119,7 @@ class OpenPhoto(NamedTuple):
 
     @property
     def focal_ratio(self) -> float | None:
-        """The focal length over the longer side that Exif gives, None if it does not."""
+        """The focal length over the longer side that Exif gives, or None."""
         return self.exif.focal_ratio(*self.size)
 
     @property
@@ -161,11 +161,11 @@ class Photo:
 
     @property
     def is_opaque(self) -> bool:
-        """Whether there is no alpha."""
+        """Whether all pixels are opaque: the photo has three channels."""
         return bool(self.pixels.shape[2] == 3)
 
     def opaque(self) -> NDArray[np.uint8]:
-        """The photo over black, `(H, W, 3)`: what is hidden under alpha does not show."""
+        """The photo over black, `(H, W, 3)`, which hides what is under alpha."""
         rgb = self.pixels[..., :3]
         return rgb if self.is_opaque else (rgb * (self.pixels[..., 3:] / 255.0)).round().astype(np.uint8)
 
@@ -175,7 +175,7 @@ class Photo:
 
 
 def open_photos(paths: list[Path], masks: Path | None = None) -> list[OpenPhoto]:
-    """Open photos without decoding them. `read_photos` decodes the bytes that are read here, and opens no file again.
+    """Open photos and read their bytes, which `read_photos` decodes.
 
     `masks` is a folder with masks of photos; None: `masks/` beside the photos, if there is one.
 
@@ -259,7 +259,7 @@ def _cut(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
 
 
 def _reduced(image: Image, size: tuple[int, int], kept: Image | None) -> NDArray[np.uint8]:
-    """An image of 8 bits with this width and height, in which no hidden colour of the given one shows.
+    """An image of 8 bits with this width and height, of the visible colours of the given one alone.
 
     Args:
         image: RGB or RGBA, not premultiplied, in [0, 1].
@@ -280,7 +280,7 @@ def _eight_bits(image: Image) -> NDArray[np.uint8]:
 
 
 def _kept(photo: OpenPhoto) -> Image | None:
-    """The share of each pixel of the upright photo that its mask keeps, `(H, W)`; None without a mask.
+    """The share of each pixel of the upright photo that its mask keeps, `(H, W)`, or None.
 
     The file is upright, too, unless its shape is that of the stored photo.
 
@@ -322,7 +322,7 @@ def sharpness(grey: NDArray[np.uint8], mask: NDArray[np.uint8] | None = None) ->
 
 
 def by_shape(photos: list[OpenPhoto]) -> dict[str, list[OpenPhoto]]:
-    """The photos by their shape, as "4032x3024": that of the first of each group; upright and lying are one."""
+    """The photos by their shape, as "4032x3024", that of the first of each group. Upright and lying are one."""
     groups: dict[tuple[int, int], list[OpenPhoto]] = defaultdict(list)
     for photo in photos:
         known = (size for size in groups if _same_shape(size, photo.size))
@@ -331,7 +331,7 @@ def by_shape(photos: list[OpenPhoto]) -> dict[str, list[OpenPhoto]]:
 
 
 def unlike_others(photos: list[OpenPhoto]) -> dict[str, str]:
-    """Photos that are copies, or of another shape than most without a focal length in their Exif, and why.
+    """Photos that are copies, or that have another shape than most and an unknown focal length, and why.
 
     Raises:
         PhotosRefused: most photos are panoramas, there are fewer than `MIN_PHOTOS` without copies, or no shape is that
@@ -366,7 +366,7 @@ def unlike_others(photos: list[OpenPhoto]) -> dict[str, str]:
 
 
 def _lens_numbers(photos: list[OpenPhoto]) -> dict[str, int]:
-    """The number of each photo's lens by its name; 0 took most.
+    """The number of each photo's lens by its name. Lens 0 took most.
 
     Photos of each shape have lenses of their own, one for each focal length of the Exif: those that differ by at most
     10 % are one. The first of them took also those whose Exif says none.

@@ -100,7 +100,10 @@ def _look(video: Path, bar: ProgressBar) -> list[_Frame]:
             pixels = reader.read(index)
             if pixels is None:
                 break
-            grey = _small(pixels)
+            scale = min(1.0, _LONGEST / max(pixels.shape))
+            full = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
+            resized = cv2.resize(full, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+            grey = np.asarray(resized, np.uint8)
             frames.append(_Frame(index, sharpness(grey), motion.way_to(grey)))
     if not frames:
         raise DataError(video, "", "a video", "a file without frames that can be decoded")
@@ -177,7 +180,7 @@ class _Reader:
         self._pixel_width = self._aspect()  # over its height
 
     def _aspect(self) -> float:
-        """Width over height of a pixel of an upright frame; 1 where the header does not say."""
+        """Width over height of a pixel of an upright frame, or 1."""
         width, height = (self._capture.get(key) for key in (cv2.CAP_PROP_SAR_NUM, cv2.CAP_PROP_SAR_DEN))
         if not (width > 0 and height > 0 and 1 / _WIDEST_PIXEL <= width / height <= _WIDEST_PIXEL):
             return 1.0
@@ -191,7 +194,7 @@ class _Reader:
         self._capture.release()
 
     def read(self, index: int) -> NDArray[np.uint8] | None:
-        """A frame, `(H, W, 3)` BGR, not before the last one that was read; None behind the end.
+        """A frame, `(H, W, 3)` BGR, behind the last one that was read, or None behind the end.
 
         It is never made smaller to have square pixels.
         """
@@ -207,9 +210,3 @@ class _Reader:
         if size == (width, height):
             return np.asarray(pixels, np.uint8)
         return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_CUBIC), np.uint8)
-
-
-def _small(pixels: NDArray[np.uint8]) -> Grey:
-    scale = min(1.0, _LONGEST / max(pixels.shape))
-    grey = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
-    return np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)

@@ -21,7 +21,7 @@ _COUNTERCLOCKWISE = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]
 
 
 def write_images(folder: Path, photos: list[Photo], names: list[str], opaque: bool = False) -> None:
-    """Write the photos, or these over black, as PNGs without metadata: another JPEG compression would lose detail."""
+    """Write the photos, or these over black, as plain PNGs: another JPEG compression would lose detail."""
     for photo, name in zip(photos, names, strict=True):
         pixels = photo.opaque() if opaque else photo.pixels
         write_png(folder / name, torch.from_numpy(np.ascontiguousarray(pixels)).permute(2, 0, 1))
@@ -127,7 +127,7 @@ def _depths(scene: Any, image: Any) -> NDArray[np.float64]:
 
 
 def leveling(up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The smallest rotation that turns a vector to -y; the identity if the vector is 0.
+    """The smallest rotation that turns a vector to -y. Of a vector of length 0 it is the identity.
 
     One that points to +y is first turned by half a turn about z, the view of an upside-down camera.
     """

@@ -40,7 +40,7 @@ def table_width(channels: int, median_depth: bool) -> int:
     return -(-(7 + channels + median_depth) // WIDTH) * WIDTH
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Band:
     """The lists of the tiles in some rows, front to back."""
 
@@ -51,7 +51,7 @@ class Band:
     entries: NDArray[np.int32]  # numbers of members
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RowSlice:
     """Some rows of tiles: the spans in them, and how they are divided into bands."""
 

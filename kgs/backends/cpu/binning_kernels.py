@@ -17,13 +17,13 @@ from kgs._support.compiled.lanes import WIDTH, load, store
 SIZE = 8  # side of a tile; a constant, so that loops over pixels have a constant length
 _BITS, _BUCKETS = 11, 2048
 _ROOT = f32(math.sqrt(0.5 * math.log2(math.e)))  # exp(-q / 2) = 2^-(ROOT^2 q): folded into the whitening vectors
-_WIDER = f32(1e-3)  # see kgs.projection.cut_squared
+_WIDER = f32(1e-3)  # see kgs.geometry.projection.cut_squared
 _INFINITY = f32(np.inf)
 
 
 @inline
 def variances(a0, a1, a2, b0, b1, b2, eps2d):
-    """Entries xx, xy, yy and determinant of M M^T + e I for the rows a, b of M, see `kgs.covariance`."""
+    """Entries xx, xy, yy and determinant of M M^T + e I for the rows a, b of M, see `kgs.geometry.covariance`."""
     xx, xy, yy = a0 * a0 + a1 * a1 + a2 * a2, a0 * b0 + a1 * b1 + a2 * b2, b0 * b0 + b1 * b1 + b2 * b2
     u, v, w = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
     return xx + eps2d, xy, yy + eps2d, u * u + v * v + w * w + eps2d * (xx + yy) + eps2d * eps2d

@@ -12,7 +12,7 @@ from kgs._support.memory import array, empty
 from kgs._support.torch_threads import thread_count
 from kgs.backends.row_slices import MAX_BYTES, row_slices
 from kgs.backends.signatures import Compositor, Images, Inputs
-from kgs.types import ProjectedGaussians, RasterOptions
+from kgs.geometry.types import ProjectedGaussians, RasterOptions
 
 from . import compositing_kernels as kernels
 from .binning import Band, RowSlice, TileCoverage, table_width
@@ -21,7 +21,7 @@ _NUMBER = 4  # bytes
 Floats = NDArray[np.float32]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Done:
     """A band after the forward pass."""
 

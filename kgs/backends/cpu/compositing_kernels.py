@@ -392,7 +392,7 @@ def add_members(begin, end, offsets, members, sums, totals):
 def fill_gradients(
     begin, end, ranks, totals, factors, opacities, eps2d, d_means2d, d_factors, d_opacities, d_features, d_absolute,
 ):  # fmt: skip
-    """From moments to gradients, see `kgs.covariance.moment_gradients`; what is not wanted is empty."""
+    """From moments to gradients, see `kgs.geometry.covariance.moment_gradients`; what is not wanted is empty."""
     F = d_features.shape[1] if len(d_features) else 0
     needs_moments = len(d_opacities) > 0
     needs_absolute = len(d_absolute) > 0

@@ -1,4 +1,4 @@
-"""Spherical harmonics up to degree 3 at one direction: basis, colour and derivative; formulas as in `kgs.harmonics`."""
+"""Spherical harmonics up to degree 3 at one direction: basis, colour, derivative; as in `kgs.geometry.harmonics`."""
 
 from kgs._support.compiled.kernel import HALF, TWO, ZERO, f32, inline
 

@@ -15,9 +15,10 @@ from kgs._support.compiled.threads import parallel_for
 from kgs._support.memory import array, empty
 from kgs._support.torch_threads import thread_count
 from kgs.backends.torch.projection import project as project_in_torch
-from kgs.camera import MARGIN, Cameras, Frame, whole_frame
-from kgs.projection import finite_gaussians, visibility_cutoff
-from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
+from kgs.geometry.cameras import Cameras
+from kgs.geometry.lenses import MARGIN, Frame, whole_frame
+from kgs.geometry.projection import finite_gaussians, visibility_cutoff
+from kgs.geometry.types import Gaussians, ProjectedGaussians, RasterOptions
 
 from .camera_kernels import camera_gradients
 from .projection_kernels import BLOCK, footprint_gradients, footprints

@@ -1,6 +1,6 @@
 """Projection by pinhole cameras with the colours of harmonics, and its gradient: one Gaussian at a time.
 
-The formulas are those of `kgs.projection`, `kgs.camera` and `kgs.covariance`; gradients of cameras are in
+The formulas are those of `projection`, `lenses` and `covariance` in `kgs.geometry`; gradients of cameras are in
 :mod:`.camera_kernels`. A camera is a tuple: world to camera `(3, 4)`, intrinsics `(2, 3)`, limits of x / z and y / z
 `(2, 2)`, inverse of the pose's 3x3 block, centre `(3,)`.
 """

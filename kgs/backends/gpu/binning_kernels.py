@@ -14,7 +14,7 @@ from .footprint_kernels import load_factors, variances
 _S: tl.constexpr = tl.constexpr(SIZE)
 _ROOT: tl.constexpr = tl.constexpr(0.8493218002880191)  # sqrt(log2(e) / 2): exp(-q / 2) = 2^-(ROOT^2 q)
 _TWICE_LN2: tl.constexpr = tl.constexpr(1.3862943611198906)
-_WIDER: tl.constexpr = tl.constexpr(1e-3)  # see `kgs.projection.cut_squared`
+_WIDER: tl.constexpr = tl.constexpr(1e-3)  # see `kgs.geometry.projection.cut_squared`
 
 
 @triton.jit(do_not_specialize=["n"])

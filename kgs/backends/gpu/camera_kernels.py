@@ -1,8 +1,8 @@
 """What kernels read of a pinhole camera, as one row of numbers; and the gradients of cameras.
 
 A row, `WIDTH` numbers: world to camera (3, 4), intrinsics (2, 3), limits of x / z, then of y / z, the centre (3,),
-whether the kernels cover it, the inverse of the pose's 3x3 block, and `kgs.projection.visibility_cutoff`, which is the
-same for all cameras.
+whether the kernels cover it, the inverse of the pose's 3x3 block, and the `visibility_cutoff` of
+`kgs.geometry.projection`, which is the same for all cameras.
 """
 
 import triton
@@ -18,7 +18,7 @@ CUTOFF = 35  # column: how many standard deviations of a footprint count as visi
 _WIDTH: tl.constexpr = tl.constexpr(WIDTH)
 _COVERED: tl.constexpr = tl.constexpr(COVERED)
 _CUTOFF: tl.constexpr = tl.constexpr(CUTOFF)
-_WIDER: tl.constexpr = tl.constexpr(1e-3)  # see `kgs.projection.cut_squared`
+_WIDER: tl.constexpr = tl.constexpr(1e-3)  # see `kgs.geometry.projection.cut_squared`
 
 
 @triton.jit
@@ -31,7 +31,7 @@ def _cofactor(pose, i, j):
 
 @triton.jit
 def _store_limits(out, focal, centre, low, high, margin):
-    """The limits of a tangent, see `kgs.camera.tangent_limits`."""
+    """The limits of a tangent, see `kgs.geometry.lenses.tangent_limits`."""
     first = -(centre - low + margin) / focal
     last = (high - centre + margin) / focal
     tl.store(out, tl.minimum(first, last))

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from kgs.backends.row_slices import check_fits, default_max_bytes
 from kgs.backends.signatures import Compositor, Images, Inputs
-from kgs.types import ProjectedGaussians, RasterOptions
+from kgs.geometry.types import ProjectedGaussians, RasterOptions
 
 from . import entry_counts
 from .binning_kernels import count_entries, fill_entries, fill_table, list_tiles
@@ -23,7 +23,7 @@ LANES = 32  # Gaussians of a program that goes through their tiles
 _BLOCK = 128  # Gaussians or entries of another
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Rows:
     """A row slice: rows of tiles, numbered through all cameras, and where the entries of each Gaussian begin."""
 
@@ -33,7 +33,7 @@ class _Rows:
     entries: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Lists:
     """The lists of a row slice, and what its forward pass left; the tensors are those of `.compositing_kernels`."""
 

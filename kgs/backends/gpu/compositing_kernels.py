@@ -246,7 +246,7 @@ def sum_entries(
     MOMENTS: tl.constexpr, WITH_FEATURES: tl.constexpr, ABSOLUTE: tl.constexpr,
     ADD: tl.constexpr, ADD_FEATURES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Add up the rows of each Gaussian, and turn its moments into gradients: `kgs.covariance.moment_gradients`.
+    """Add up the rows of each Gaussian, and turn its moments into gradients, as `covariance.moment_gradients` does.
 
     A Gaussian's rows lie side by side, from `begins[i]` on. A lane adds up those of one Gaussian, four numbers at a
     time; where a few Gaussians of a block have most of its rows, all lanes add up those of each. `ADD` adds to the

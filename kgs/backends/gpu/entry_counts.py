@@ -6,7 +6,7 @@ from weakref import WeakKeyDictionary
 
 from torch import Tensor
 
-from kgs.types import ProjectedGaussians
+from kgs.geometry.types import ProjectedGaussians
 
 
 class EntryCounts(NamedTuple):

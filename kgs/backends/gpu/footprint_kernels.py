@@ -1,4 +1,4 @@
-"""What kernels of several stages share; formulas as in `kgs.covariance`."""
+"""What kernels of several stages share; formulas as in `kgs.geometry.covariance`."""
 
 import triton
 import triton.language as tl

@@ -1,4 +1,4 @@
-"""Spherical harmonics up to degree 3 at one direction for each lane: colour and derivative, as in `kgs.harmonics`."""
+"""Spherical harmonics up to degree 3, a direction a lane: colour and derivative, as in `kgs.geometry.harmonics`."""
 
 import triton
 import triton.language as tl

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from kgs._support.autograd import refuse_second_derivative
 from kgs.backends.torch.projection import project as project_in_torch
-from kgs.camera import MARGIN, Cameras, whole_frame
-from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
+from kgs.geometry.cameras import Cameras
+from kgs.geometry.lenses import MARGIN, whole_frame
+from kgs.geometry.types import Gaussians, ProjectedGaussians, RasterOptions
 
 from . import entry_counts
 from .binning_kernels import count_all_entries, sum_counts
@@ -65,7 +66,7 @@ def project(
     return projected
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Visible:
     """Which pairs (camera, Gaussian) are visible; the tensors are those of `.projection_kernels`."""
 
@@ -75,7 +76,7 @@ class _Visible:
     numbers: Tensor
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Listed:
     """The visible pairs, row by row."""
 

@@ -1,6 +1,6 @@
 """Projection by pinhole cameras with the colours of harmonics, and its gradient: a Gaussian for each lane.
 
-The formulas are those of `kgs.projection`, `kgs.camera` and `kgs.covariance`; a camera is a row of numbers, see
+The formulas are those of `projection`, `lenses` and `covariance` in `kgs.geometry`; a camera is a row of numbers, see
 :mod:`.camera_kernels`. Arrays of N Gaussians, C cameras and B blocks of Gaussians:
 
     opacities  (1, N) or (C, N)

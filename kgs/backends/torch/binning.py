@@ -17,12 +17,12 @@ import torch
 from torch import Tensor
 
 from kgs.backends.row_slices import row_slices
-from kgs.covariance import variances
-from kgs.projection import cut_squared
-from kgs.types import ProjectedGaussians, RasterOptions
+from kgs.geometry.covariance import variances
+from kgs.geometry.projection import cut_squared
+from kgs.geometry.types import ProjectedGaussians, RasterOptions
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TileLists:
     """For each tile of a row slice its list: the Gaussians that can reach it, front to back. Integers."""
 
@@ -52,7 +52,7 @@ class TileLists:
         return torch.searchsorted(sorted_entries, _arange(self.ids))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Spans:
     """For each Gaussian and each row of tiles that it reaches the first tile and how many; int32, `(S,)`."""
 

@@ -21,8 +21,8 @@ from torch import Tensor
 
 from kgs.backends.row_slices import MAX_BYTES
 from kgs.backends.signatures import Compositor, Images, Inputs
-from kgs.covariance import footprint_table, moment_gradients
-from kgs.types import ProjectedGaussians, RasterOptions
+from kgs.geometry.covariance import footprint_table, moment_gradients
+from kgs.geometry.types import ProjectedGaussians, RasterOptions
 
 from .binning import TileCoverage, TileLists
 
@@ -182,11 +182,11 @@ class Wanted:
         return sum(self.widths(features))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Columns:
     """A column of numbers for each Gaussian of a depth slice."""
 
-    table: Tensor  # (7, n + 1), see `kgs.covariance.footprint_table`
+    table: Tensor  # (7, n + 1), see `kgs.geometry.covariance.footprint_table`
     features: Tensor  # (F, n + 1)
     depths: Tensor | None  # (n + 1,), where the median depth is wanted
 
@@ -209,7 +209,7 @@ class Thresholds:
         return cls(floor, alpha, _below(stop, dtype) if stop else -1.0)
 
 
-@dataclass
+@dataclass(eq=False)
 class Chunk:
     """K layers of n tiles, and what the backward pass needs of them."""
 

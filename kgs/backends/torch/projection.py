@@ -1,4 +1,4 @@
-"""Projection in torch, for every camera, device and dtype; the formulas are in `kgs.projection` and `kgs.covariance`.
+"""Projection in torch, for every camera, device and dtype; the formulas are in `kgs.geometry`.
 
 Source: Zwicker et al. 2001 (the affine approximation at the centre), Kerbl et al. 2023.
 
@@ -10,11 +10,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from kgs.camera import Cameras, Lens, lenses, times
-from kgs.covariance import footprint_factors, variances
-from kgs.harmonics import evaluate_harmonics
-from kgs.projection import finite_gaussians, select_rows, view_directions, visibility_cutoff
-from kgs.types import Gaussians, ProjectedGaussians, RasterOptions
+from kgs.geometry.cameras import Cameras
+from kgs.geometry.covariance import footprint_factors, variances
+from kgs.geometry.harmonics import evaluate_harmonics
+from kgs.geometry.lenses import Lens, lenses, times
+from kgs.geometry.projection import finite_gaussians, select_rows, view_directions, visibility_cutoff
+from kgs.geometry.types import Gaussians, ProjectedGaussians, RasterOptions
 
 
 def project(
@@ -48,7 +49,7 @@ def project(
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Frustum:
     """What makes a Gaussian visible."""
 

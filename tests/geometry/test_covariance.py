@@ -10,7 +10,7 @@ import torch
 from mpmath import mpf
 from scipy.spatial.transform import Rotation
 
-from kgs.covariance import conics, footprint_factors, rotation_matrices, variances, whitening
+from kgs.geometry.covariance import conics, footprint_factors, rotation_matrices, variances, whitening
 
 EPS2D = 0.3
 

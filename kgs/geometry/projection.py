@@ -1,6 +1,6 @@
 """Parts of projection that the backends and outputs beside colours share.
 
-`kgs.backends.torch.projection` combines them. The footprint is in `kgs.covariance`, the lens in `kgs.camera`.
+`kgs.backends.torch.projection` combines them. The footprint is in `.covariance`, the lens in `.lenses`.
 """
 
 import torch
@@ -8,26 +8,23 @@ from torch import Tensor
 
 from kgs._support.errors import ArgumentError
 
-from .camera import Cameras, lenses, times
+from .cameras import Cameras
 from .covariance import rotation_matrices
+from .lenses import lenses, times
 from .types import Gaussians, ProjectedGaussians
 
 
-def normals(gaussians: Gaussians, cameras: Cameras, projected: ProjectedGaussians, axis: int | None = None) -> Tensor:
-    """An axis of each projected Gaussian, turned towards its camera; unit vectors in world axes, `(M, 3)`.
+def normals(gaussians: Gaussians, cameras: Cameras, projected: ProjectedGaussians) -> Tensor:
+    """The shortest axis of each projected Gaussian, turned towards its camera; unit vectors in world axes, `(M, 3)`.
 
-    The axis is the local one of this number, or the shortest for None. Differentiable with respect to the quaternions.
-    At right angles to the view either direction is correct.
+    Differentiable with respect to the quaternions. At right angles to the view either direction is correct.
     """
-    if gaussians.quats.ndim == 3 and axis is None:
+    if gaussians.quats.ndim == 3:
         raise ArgumentError("outputs", "no normals of matrices, of which no column has to be an axis")
     ids = projected.gaussian_ids
     rotations = rotation_matrices(gaussians.quats.index_select(0, ids))
-    if axis is None:
-        shortest = gaussians.scales.detach().index_select(0, ids).argmin(1)
-        normal = rotations.gather(2, shortest[:, None, None].expand(-1, 3, 1))[:, :, 0]
-    else:
-        normal = rotations[:, :, axis]
+    shortest = gaussians.scales.detach().index_select(0, ids).argmin(1)
+    normal = rotations.gather(2, shortest[:, None, None].expand(-1, 3, 1))[:, :, 0]
     with torch.no_grad():
         means = gaussians.means.index_select(0, ids)
         directions = []
@@ -72,7 +69,7 @@ def view_directions(means: Tensor, extrinsics: Tensor, parallel: bool = False) -
 
 
 def _inverse(matrix: Tensor) -> Tensor:
-    """The inverse of a 3x3 matrix by its cofactors; elementwise, as :func:`kgs.camera.times`."""
+    """The inverse of a 3x3 matrix by its cofactors; elementwise, as :func:`kgs.geometry.lenses.times`."""
     scale = matrix.detach().abs().amax()  # the products of small numbers would vanish
     x, y, z = (matrix / scale).unbind()
     cofactors = (torch.linalg.cross(y, z), torch.linalg.cross(z, x), torch.linalg.cross(x, y))

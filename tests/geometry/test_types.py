@@ -12,7 +12,7 @@ from kornia.sensors.camera import CameraModel, CameraModelType
 import kgs
 import kgs.reference
 from kgs import Gaussians, PosedCamera
-from kgs.harmonics import evaluate_harmonics
+from kgs.geometry.harmonics import evaluate_harmonics
 
 PARAMS = {
     CameraModelType.PINHOLE: 4,

@@ -7,7 +7,7 @@ import pytest
 import torch
 from oracles import real_harmonic
 
-from kgs.harmonics import SH_C0, evaluate_harmonics, harmonics_basis
+from kgs.geometry.harmonics import SH_C0, evaluate_harmonics, harmonics_basis
 
 AXES = torch.tensor(
     [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=torch.float64

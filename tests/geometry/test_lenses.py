@@ -8,7 +8,8 @@ from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.vector import Vector3
 from kornia.sensors.camera import CameraModelType
 
-from kgs.camera import image_size, lenses, pinhole_cameras
+from kgs.geometry.cameras import image_size, pinhole_cameras
+from kgs.geometry.lenses import lenses
 
 HEIGHT, WIDTH = 48, 64
 INTRINSICS = LENS_PARAMS[CameraModelType.PINHOLE]  # fx fy cx cy, off centre
