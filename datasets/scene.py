@@ -75,14 +75,17 @@ class Views(ShownByShapes):
         if not bool(((self.cameras.height == height) & (self.cameras.width == width)).all()):
             sizes = [self.cameras.height.tolist(), self.cameras.width.tolist()]
             raise ArgumentError("cameras", f"height {height} and width {width} as images", sizes)
-        if self.alphas is not None and tuple(self.alphas.shape) != (count, 1, height, width):
-            raise ArgumentError("alphas", f"shape ({count}, 1, {height}, {width})", tuple(self.alphas.shape))
-        if self.border_mask is not None and tuple(self.border_mask.shape) != (height, width):
-            raise ArgumentError("border_mask", f"shape ({height}, {width})", tuple(self.border_mask.shape))
-        if self.valid_mask is not None and tuple(self.valid_mask.shape) != (count, height, width):
-            raise ArgumentError("valid_mask", f"shape ({count}, {height}, {width})", tuple(self.valid_mask.shape))
-        if self.gains is not None and (tuple(self.gains.shape) != (count, 3) or not bool((self.gains > 0).all())):
-            raise ArgumentError("gains", f"numbers above 0 of shape ({count}, 3)", self.gains.tolist())
+        shapes = {
+            "alphas": (count, 1, height, width),
+            "border_mask": (height, width),
+            "valid_mask": (count, height, width),
+            "gains": (count, 3),
+        }
+        for name, shape in shapes.items():
+            if (value := getattr(self, name)) is not None and tuple(value.shape) != shape:
+                raise ArgumentError(name, f"shape {shape}", tuple(value.shape))
+        if self.gains is not None and not bool((self.gains > 0).all()):
+            raise ArgumentError("gains", "numbers above 0", self.gains.tolist())
         if self.turned is not None and len(self.turned) != count:
             raise ArgumentError("turned", f"{count} as names", len(self.turned))
 
@@ -118,20 +121,15 @@ class Views(ShownByShapes):
     def select(self, indices: Sequence[int]) -> Self:
         """The views at the given positions, in that order."""
         rows = torch.tensor(indices, dtype=torch.int64, device="cpu")
-        alphas = None if self.alphas is None else self.alphas[rows]
-        valid_mask = None if self.valid_mask is None else self.valid_mask[rows]
-        names = tuple(self.names[i] for i in indices)
-        turned = None if self.turned is None else tuple(self.turned[i] for i in indices)
-        gains = None if self.gains is None else self.gains[rows]
         return replace(
             self,
             cameras=self.camera(rows),
             images=self.images[rows],
-            names=names,
-            alphas=alphas,
-            valid_mask=valid_mask,
-            turned=turned,
-            gains=gains,
+            names=tuple(self.names[i] for i in indices),
+            alphas=None if self.alphas is None else self.alphas[rows],
+            valid_mask=None if self.valid_mask is None else self.valid_mask[rows],
+            gains=None if self.gains is None else self.gains[rows],
+            turned=None if self.turned is None else tuple(self.turned[i] for i in indices),
         )
 
     def render(self, index: int, render: Callable[..., Tensor]) -> Tensor:

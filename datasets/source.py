@@ -51,7 +51,7 @@ class SceneSource:
         """Width and height of the first photo, which are those of all or turned; errors as of :meth:`frames`."""
         frames = self.frames(photo_folder).frames
         if not frames:
-            raise DataError(self.root, "", "expected posed images, got none")
+            raise DataError(self.root, "", "posed images", "none")
         return frames[0].image.size
 
     def frames(self, photo_folder: str = "") -> "FrameSet":

@@ -8,14 +8,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from kgs._support.checks import check_kind, check_tensor
+from kgs._support.checks import check_kind
 from kgs._support.errors import ArgumentError, quoted
 
 from .backends import Backend, check_backend, get_backend
 from .geometry.cameras import Cameras
 from .geometry.projection import normals
 from .geometry.types import Gaussians, RasterOptions, Rendering, raster_options
-from .stages import outside_graphs, project, rasterize
+from .stages import blend, outside_graphs, project, rasterize
 
 _OUTPUTS = ("image", "alpha", "depth", "median_depth", "normal")
 
@@ -150,19 +150,3 @@ class GaussianRenderer(nn.Module):
         options = vars(self.options).items()
         texts = (f"{name}={value:g}" if isinstance(value, float) else f"{name}={value}" for name, value in options)
         return ", ".join(texts)
-
-
-def blend(
-    image: Tensor, transmittance: Tensor, background: Tensor | None, backend: Backend, name: str = "background"
-) -> Tensor:
-    """The image `(C, D, H, W)` over a background, seen through the transmittance `(C, 1, H, W)`."""
-    if background is None:
-        return image
-    check_tensor(name, background, image, " as the image")
-    full = tuple(image.shape)
-    shape = tuple(background.shape)
-    if shape in (full[1:2], full[:2]):
-        background = background.reshape(*shape, 1, 1)
-    elif shape not in (full[1:], full):
-        raise ArgumentError(name, f"shape {full[1:2]}, {full[:2]}, {full[1:]} or {full}", shape)
-    return backend.covering("blending", image).blend(image, transmittance, background)

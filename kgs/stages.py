@@ -1,7 +1,6 @@
 """The two stages of a render, `project` and `composite`: arguments are checked here, and a backend does the work."""
 
 import functools
-import math
 import weakref
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,7 +17,7 @@ from kgs._support.errors import ArgumentError
 from .backends import Backend, get_backend
 from .backends.signatures import Compositor, Images
 from .geometry.cameras import Cameras, image_size, intrinsics, with_constant_last_rows
-from .geometry.covariance import compensations, reach, variances
+from .geometry.projection import with_options
 from .geometry.types import Composited, Gaussians, ProjectedGaussians, RasterOptions, raster_options
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -82,27 +81,7 @@ def project(
         raise ArgumentError("opacities", f"shape ({n},) or ({count}, {n}) for {count} cameras", shape)
     cameras = with_constant_last_rows(cameras)
     chosen = get_backend(backend, gaussians.means.device).covering("projection", gaussians.means)
-    return _with_options(chosen.project(gaussians, cameras, size, options, colors), options)
-
-
-def _with_options(projected: ProjectedGaussians, options: RasterOptions) -> ProjectedGaussians:
-    """Apply far_plane, radius_clip and antialiased, which most renders leave off."""
-    if options.far_plane < math.inf or options.radius_clip > 0:
-        visible = projected.depths < options.far_plane
-        if options.radius_clip > 0:
-            xx, _, yy, _ = variances(projected.factors.detach(), options.eps2d)
-            visible &= reach(xx, yy).amax(1) > options.radius_clip
-        projected = _select(projected, visible.nonzero()[:, 0])
-    if options.antialiased and options.eps2d > 0:
-        opacities = projected.opacities * compensations(projected.factors, options.eps2d)
-        projected = replace(projected, opacities=opacities)
-    return projected
-
-
-def _select(projected: ProjectedGaussians, rows: Tensor) -> ProjectedGaussians:
-    """Some of the visible pairs."""
-    names = ("camera_ids", "gaussian_ids", "means2d", "factors", "depths", "radii", "opacities", "colors")
-    return replace(projected, **{name: getattr(projected, name).index_select(0, rows) for name in names})
+    return with_options(chosen.project(gaussians, cameras, size, options, colors), options)
 
 
 def composite(
@@ -174,6 +153,22 @@ def rasterize(
     hook = absgrad_hook or _setter(projected.means2d)
     sums, transmittance, median = _Composite.apply(*inputs, compositor, keep, hook)
     return Composited(sums, transmittance, median if median_depth else None, tile_size)
+
+
+def blend(
+    image: Tensor, transmittance: Tensor, background: Tensor | None, backend: Backend, name: str = "background"
+) -> Tensor:
+    """The image `(C, D, H, W)` over a background, seen through the transmittance `(C, 1, H, W)`."""
+    if background is None:
+        return image
+    check_tensor(name, background, image, " as the image")
+    full = tuple(image.shape)
+    shape = tuple(background.shape)
+    if shape in (full[1:2], full[:2]):
+        background = background.reshape(*shape, 1, 1)
+    elif shape not in (full[1:], full):
+        raise ArgumentError(name, f"shape {full[1:2]}, {full[:2]}, {full[1:]} or {full}", shape)
+    return backend.covering("blending", image).blend(image, transmittance, background)
 
 
 @functools.lru_cache

@@ -15,7 +15,8 @@ from kgs.geometry.cameras import to
 from kgs.geometry.types import RasterOptions
 from kgs.metrics.evaluate import mean_psnr
 from kgs.model import GaussianModel
-from kgs.renderer import GaussianRenderer, blend
+from kgs.renderer import GaussianRenderer
+from kgs.stages import blend
 
 from .config import Settings
 from .decisions import Decisions

@@ -18,6 +18,8 @@ import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor
 
+from kgs._support.autograd import refuse_second_derivative
+
 
 def rotation_matrices(quats: Tensor) -> Tensor:
     """Rotation matrices `(N, 3, 3)` of quaternions w, x, y, z of any norm, `(N, 4)`; matrices are returned as they are.
@@ -40,15 +42,15 @@ def footprint_factors(rows: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
         axes = quats * scales[:, None]
         turned: Tensor = (rows[:, :, :, None] * axes[:, None]).sum(2)
         return turned
-    factors: Tensor = _FootprintFactors.apply(rows, quats, scales)
+    factors: Tensor = _FootprintFactors.apply(rows, quats, scales)[0]
     return factors
 
 
 class _FootprintFactors(torch.autograd.Function):
-    """`footprint_factors` of quaternions."""
+    """`footprint_factors` of quaternions, and what their gradient needs."""
 
     @staticmethod
-    def forward(ctx: Any, rows: Tensor, quats: Tensor, scales: Tensor) -> Tensor:
+    def forward(rows: Tensor, quats: Tensor, scales: Tensor) -> tuple[Tensor, ...]:
         a = columns(rows)
         s = columns(scales)
         peak = quats.abs().amax(1)
@@ -59,14 +61,20 @@ class _FootprintFactors(torch.autograd.Function):
         inverse_norm = torch.where(norm > 0, 1.0 / (norm * peak), 0.0)
         r = _rotation_columns(q)
         turned = torch.stack([_dot(a[3 * i : 3 * i + 3], r[j::3]) for i in (0, 1) for j in (0, 1, 2)])
-        ctx.save_for_backward(a, q, inverse_norm, s, turned)
         factors: Tensor = (turned.unflatten(0, (2, 3)) * s).permute(2, 0, 1).contiguous()
-        return factors
+        return factors, a, q, inverse_norm, s, turned
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        if torch.is_grad_enabled():
-            raise RuntimeError("project: expected backward without create_graph, footprints have no second derivative")
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, ...]) -> None:
+        ctx.save_for_backward(*output[1:])
+        ctx.mark_non_differentiable(*output[1:])
+        ctx.set_materialize_grads(False)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
+        refuse_second_derivative("project")
+        if grad is None:
+            return None, None, None
         a, q, inverse_norm, s, turned = ctx.saved_tensors
         d_rows = d_quats = d_scales = None
         g = columns(grad)
@@ -93,15 +101,15 @@ def covariance_factors(covariances: Tensor) -> Tensor:
     The gradient is (G A^-1 + (G A^-1)^T) / 4 of a gradient G by A: right for every function of A A^T, once. In float32
     its error is about 1e-7 times the ratio of the longest to the shortest axis; of an axis of length 0 it is 0.
     """
-    factors: Tensor = _HalfAxes.apply(covariances)
+    factors: Tensor = _HalfAxes.apply(covariances)[0]
     return factors
 
 
 class _HalfAxes(torch.autograd.Function):
-    """`covariance_factors` and its gradient."""
+    """`covariance_factors`, and the same in float64, which the gradient needs."""
 
     @staticmethod
-    def forward(ctx: Any, covariances: Tensor) -> Tensor:
+    def forward(covariances: Tensor) -> tuple[Tensor, Tensor]:
         xx, xy, xz, yx, yy, yz, zx, zy, zz = covariances.double().flatten(1).unbind(1)
         xy = (xy + yx) / 2
         xz = (xz + zx) / 2
@@ -118,16 +126,16 @@ class _HalfAxes(torch.autograd.Function):
         factors = torch.stack([a, zero, zero, b, d, zero, c, e, f], 1).unflatten(1, (3, 3))
         finite = covariances.isfinite().flatten(1).all(1)
         factors = factors.masked_fill(~finite[:, None, None], torch.nan)
-        ctx.save_for_backward(factors)
-        rounded: Tensor = factors.to(covariances.dtype)
-        return rounded
+        return factors.to(covariances.dtype, copy=True), factors
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> Tensor:
-        if torch.is_grad_enabled():
-            raise RuntimeError(
-                "covariance_factors: expected backward without create_graph, there is no second derivative"
-            )
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: tuple[Tensor, Tensor]) -> None:
+        ctx.save_for_backward(output[1])
+        ctx.mark_non_differentiable(output[1])
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor, _: Tensor) -> Tensor:
+        refuse_second_derivative("covariance_factors")
         (factors,) = ctx.saved_tensors
         flat = factors.diagonal(dim1=1, dim2=2) == 0  # the gradient is 0 there, too
         whole = factors + torch.diag_embed(flat.double())

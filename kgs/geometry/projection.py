@@ -3,15 +3,37 @@
 `kgs.backends.torch.projection` combines them. The footprint is in `.covariance`, the lens in `.lenses`.
 """
 
+import math
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from kgs._support.errors import ArgumentError
 
 from .cameras import Cameras
-from .covariance import rotation_matrices
+from .covariance import compensations, reach, rotation_matrices, variances
 from .lenses import lenses, times
-from .types import Gaussians, ProjectedGaussians
+from .types import Gaussians, ProjectedGaussians, RasterOptions
+
+
+def with_options(projected: ProjectedGaussians, options: RasterOptions) -> ProjectedGaussians:
+    """The visible pairs that `far_plane` and `radius_clip` leave, with the opacities of `antialiased`."""
+    if options.far_plane < math.inf or options.radius_clip > 0:
+        visible = projected.depths < options.far_plane
+        if options.radius_clip > 0:
+            xx, _, yy, _ = variances(projected.factors.detach(), options.eps2d)
+            visible &= reach(xx, yy).amax(1) > options.radius_clip
+        projected = _select(projected, visible.nonzero()[:, 0])
+    if options.antialiased and options.eps2d > 0:
+        opacities = projected.opacities * compensations(projected.factors, options.eps2d)
+        projected = replace(projected, opacities=opacities)
+    return projected
+
+
+def _select(projected: ProjectedGaussians, rows: Tensor) -> ProjectedGaussians:
+    names = ("camera_ids", "gaussian_ids", "means2d", "factors", "depths", "radii", "opacities", "colors")
+    return replace(projected, **{name: getattr(projected, name).index_select(0, rows) for name in names})
 
 
 def normals(gaussians: Gaussians, cameras: Cameras, projected: ProjectedGaussians) -> Tensor:

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from kgs.backends import Backend, get_backend
 from kgs.geometry.types import RasterOptions
-from kgs.renderer import blend
-from kgs.stages import project, rasterize
+from kgs.stages import blend, project, rasterize
 
 from .arguments import as_kgs, check_words, refuse
 from .meta import Pairs

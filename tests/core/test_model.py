@@ -7,6 +7,7 @@ import torch
 from factories import other_defaults, pinhole
 from factories import random_cloud as cloud
 from factories import random_model as model
+from refusals import refused
 from torch import nn
 
 from kgs import ArgumentError, GaussianRenderer
@@ -109,7 +110,7 @@ def test_a_state_that_does_not_fit_together_is_refused_and_changes_nothing():
     changes = {"quats": torch.zeros(8, 4), "sh_rest": torch.zeros(9, 5, 3), "_extra_state": torch.tensor(4)}
     for name, change in changes.items():
         named = "sh_degree" if name == "_extra_state" else name
-        with pytest.raises(ValueError, match=f"^{named}:"):
+        with refused(ArgumentError, name=named):
             other.load_state_dict(made.state_dict() | {name: change})
         assert all(torch.equal(value, before[name]) for name, value in other.state_dict().items())
     with pytest.raises(RuntimeError, match="Missing key"):

@@ -7,8 +7,9 @@ import weakref
 import pytest
 import torch
 from factories import FIELDS, batch, leaves, random_camera, random_gaussians
+from refusals import refused
 
-from kgs import GaussianRenderer, rasterization
+from kgs import ArgumentError, GaussianRenderer, rasterization
 
 pytestmark = pytest.mark.usefixtures("each_backend")
 
@@ -121,14 +122,14 @@ REFUSED = {
 def test_what_kgs_does_not_do_is_an_error_that_names_the_argument(name, value):
     gaussians, cameras = scene()
     named = "colors" if (name, value) == ("sh_degree", 0) else name
-    with pytest.raises(ValueError, match=f"^{named}:"):
+    with refused(ArgumentError, name=named):
         call(gaussians, cameras, **{name: value})
 
 
 @pytest.mark.usefixtures("torch_alone")
 def test_harmonics_through_an_orthographic_lens_are_refused():
     """gsplat takes their directions from the camera's centre, kgs along the rays."""
-    with pytest.raises(ValueError, match="^sh_degree:"):
+    with refused(ArgumentError, name="sh_degree"):
         call(*scene(sh_degree=1), sh_degree=1, camera_model="ortho")
 
 

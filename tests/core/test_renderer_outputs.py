@@ -10,7 +10,8 @@ from kornia.sensors.camera import CameraModelType
 
 import kgs
 from kgs import GaussianRenderer
-from kgs.renderer import blend
+from kgs.backends import BACKENDS
+from kgs.stages import blend
 
 pytestmark = pytest.mark.usefixtures("each_backend")
 
@@ -90,7 +91,7 @@ def test_one_color_behind_an_image_is_added_as_torch_adds_it(rounding):
     image, transmittance = torch.rand(2, 3, 5, 7, requires_grad=True), torch.rand(2, 1, 5, 7, requires_grad=True)
     color = torch.rand(3)
     weights = torch.rand(2, 3, 5, 7)
-    found = blend(image, transmittance, color, "torch")
+    found = blend(image, transmittance, color, BACKENDS["torch"])
     expected = torch.addcmul(image, transmittance, color[:, None, None])
     assert torch.equal(found, expected)
     with rounding:

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 from tiny_scenes import write_blender, write_llff, write_llff_rows, write_photos
 
 from kgs import DataError
@@ -42,7 +43,7 @@ def test_a_folder_that_is_named_is_taken(download):
     write_photos(download / "images_8", size=(252, 189))
     assert load_scene(download, hold_out=0, photo_folder="images_8").train.images.shape[-2:] == (189, 252)
     assert load_scene(download, hold_out=0).train.images.shape[-2:] == (378, 504)
-    with pytest.raises(DataError, match="images_4/"):
+    with refused(DataError, expected="the photos in images_4/"):
         load_scene(download, photo_folder="images_4")
 
 
@@ -76,5 +77,5 @@ def test_images_of_blender_are_halved(tmp_path):
 
 
 def test_a_folder_that_is_no_scene_is_refused(tmp_path):
-    with pytest.raises(DataError, match="expected a scene"):
+    with refused(DataError, path=tmp_path, expected="a scene"):
         field_size(tmp_path)

@@ -38,11 +38,6 @@ def test_a_point_projects_to_the_same_position_in_a_halved_picture(size):
     assert torch.allclose(half.images[0, 1, 0, 3], torch.tensor(6.5 / 100))
 
 
-def test_a_single_row_cannot_be_halved():
-    with pytest.raises(ValueError, match="2 x 2"):
-        views(1, 8).downsample(2)
-
-
 def test_views_are_a_data_set_of_dicts():
     given = views(6, 8)
     assert len(given) == len(list(given)) == 2

@@ -179,28 +179,6 @@ def test_a_texture_is_a_function_of_the_point_alone():
         np.testing.assert_array_equal(texture(points[start:stop]), whole[start:stop])
 
 
-@pytest.mark.parametrize(
-    ("arguments", "name"),
-    [
-        ({"train_views": 0}, "train_views"),
-        ({"test_views": -1}, "test_views"),
-        ({"size": (0, 8)}, "size"),
-    ],
-)
-def test_wrong_arguments_are_named(arguments, name):
-    with pytest.raises(ValueError, match=f"^{name}: expected"):
-        synthetic_scene(**arguments)
-
-
-def test_depths_refuse_mixed_sizes(scene):
-    mixed = scene.train.camera([0, 1])
-    mixed.height[1] = 64.0
-    with pytest.raises(ValueError, match=r"^cameras: expected one image size"):
-        synthetic_depths(mixed)
-    with pytest.raises(ValueError, match=r"^triangles: expected"):
-        raycast(np.zeros((3, 3)), np.eye(3), np.eye(4), (2, 2))
-
-
 def _photo_error(source, i, target, j):
     """View i of `source` warped into view j of `target`, where both see the surface, and the mean absolute error."""
     camera, other = target.camera(j), source.camera(i)

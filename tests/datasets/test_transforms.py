@@ -13,7 +13,6 @@ import pytest
 import torch
 from tiny_scenes import write_transforms
 
-from kgs._support.errors import DataError
 from kgs.datasets import load_scene
 
 WIDTH, HEIGHT, COUNT = 40, 30, 4
@@ -114,12 +113,6 @@ def test_what_is_not_used_may_be_not_finite(tmp_path: Path, layout: str, key: st
     path = write(tmp_path, layout, LENS, {}, {key: 1234.5})
     path.write_text(path.read_text().replace("1234.5", "NaN"))
     assert len(load_scene(tmp_path).train) == COUNT - 1
-
-
-def test_a_lens_has_a_focal_length(tmp_path: Path) -> None:
-    write(tmp_path, "nerfstudio", {"w": WIDTH, "h": HEIGHT})
-    with pytest.raises(DataError, match="camera_angle_x"):
-        load_scene(tmp_path)
 
 
 DESCRIPTIONS: list[dict[str, Any]] = [

@@ -8,6 +8,7 @@ import stat
 import pytest
 import safetensors.torch
 import torch
+from refusals import refused
 
 from kgs import DataError
 from kgs.fit import checkpoint
@@ -55,16 +56,16 @@ def test_every_flipped_byte_and_every_cut_is_found(path):
         flipped[position] ^= 1 << position % 8
         for damaged in (flipped, content[:position]):
             path.write_bytes(damaged)
-            with pytest.raises(DataError, match="checkpoint"):
+            with refused(DataError, path=path):
                 load_checkpoint(path)
     path.write_bytes(content + b"1")
-    with pytest.raises(DataError, match="checkpoint"):
+    with refused(DataError, path=path):
         load_checkpoint(path)
 
 
 def test_safetensors_of_other_programs_are_refused(path):
     safetensors.torch.save_file({"x": torch.ones(3)}, path, {"format": "pt"})
-    with pytest.raises(DataError, match="format: expected '.*', got 'pt'"):
+    with refused(DataError, path=path, key="format", got="'pt'"):
         load_checkpoint(path)
 
 
@@ -75,22 +76,19 @@ def sealed(text, tensors):
 
 
 @pytest.mark.parametrize(
-    ("text", "tensors", "reason"),
+    ("text", "tensors", "key"),
     [
-        ("{}", {"x": torch.tensor([torch.nan])}, "x: expected finite"),
-        ("{}", {"model/x": torch.ones(1)}, "model: expected this entry"),
-        ('{"model":[]}', {"model/x": torch.ones(1)}, "indices"),
-        ('{"model":3}', {"model/x": torch.ones(1)}, "item assignment"),
-        ("[]", {}, "expected a dict"),
-        ('{"x":NaN}', {}, "finite"),
-        ('{"x":1e400}', {}, "finite"),
-        ("[" * 100_000, {}, "nested too deep"),
-        ("", {}, "Expecting value"),
+        ("{}", {"x": torch.tensor([torch.nan])}, "x"),
+        ("{}", {"model/x": torch.ones(1)}, "model"),
+        ('{"model":[]}', {"model/x": torch.ones(1)}, ""),
+        ('{"model":3}', {"model/x": torch.ones(1)}, ""),
+        ("[]", {}, "state"),
+        *[(text, {}, "") for text in ('{"x":NaN}', '{"x":1e400}', "[" * 100_000, "")],
     ],
 )
-def test_a_right_checksum_is_not_trusted(path, text, tensors, reason):
+def test_a_right_checksum_is_not_trusted(path, text, tensors, key):
     path.write_bytes(sealed(text, tensors))
-    with pytest.raises(DataError, match=reason):
+    with refused(DataError, path=path, key=key):
         load_checkpoint(path)
 
 
@@ -134,7 +132,7 @@ def test_the_last_two_are_kept_and_the_newest_whole_one_is_found(path):
     path.unlink()
     assert newest_checkpoint(path)[0] == {"step": 2}
     previous(path).write_bytes(b"")
-    with pytest.raises(DataError, match=r"checkpoint\.safetensors"):
+    with refused(DataError, path=path):
         newest_checkpoint(path)
 
 

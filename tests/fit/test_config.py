@@ -72,16 +72,17 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in WRONG.items() for value in values])
-def test_values_out_of_range_or_of_another_kind_are_refused_by_name(name, value):
+OF_RECIPE = {"lr_means": 0, "lr_sh_dc": -1, "reset_opacity": 1.0, "adam_eps": math.nan}
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "value"),
+    [(FitConfig, name, value) for name, values in WRONG.items() for value in values]
+    + [(Recipe, name, value) for name, value in OF_RECIPE.items()],
+)
+def test_values_out_of_range_or_of_another_kind_are_refused_by_name(kind, name, value):
     with refused(ArgumentError, name="init_file" if value == "file" else name):
-        FitConfig(**{name: value})
-
-
-@pytest.mark.parametrize("wrong", [{"lr_means": 0}, {"lr_sh_dc": -1}, {"reset_opacity": 1.0}, {"adam_eps": math.nan}])
-def test_the_recipe_is_held_to_its_ranges_too(wrong):
-    with refused(ArgumentError, name=next(iter(wrong))):
-        Recipe(**wrong)
+        kind(**{name: value})
 
 
 def test_a_reset_may_not_remove_everything():
@@ -142,7 +143,7 @@ def test_what_is_given_stays_as_it_is(scene, points):
 @pytest.mark.parametrize("name", ["steps", "drop", "sh_degree", "coarse", "opacity_decay"])
 def test_settings_cannot_be_open(name):
     numbers = {"steps": 9, "drop": 0.0, "sh_degree": 0, "coarse": 0.0, "opacity_decay": 1.0}
-    with pytest.raises(ValueError, match=f"^{name}: expected"):
+    with refused(ArgumentError, name=name):
         Settings.of(FitConfig(), **numbers | {name: None})
 
 

@@ -3,7 +3,9 @@
 import pytest
 import torch
 from factories import as_model, random_gaussians, random_views
+from refusals import refused
 
+from kgs import ArgumentError
 from kgs.datasets import Scene
 from kgs.fit.fit import Fit
 from kgs.fit.scale import scaled, scaled_model
@@ -72,5 +74,5 @@ def test_a_flat_disc_stays_flat_and_the_rest_as_it_is(fit):
 @pytest.mark.parametrize("factor", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_factor_is_a_number_above_0(fit, factor):
     for function, value in ((scaled, fit), (scaled_model, fit.model)):
-        with pytest.raises(ValueError, match=r"^factor: "):
+        with refused(ArgumentError, name="factor"):
             function(value, factor)

@@ -6,8 +6,10 @@ from dataclasses import replace
 import pytest
 import torch
 from kornia.geometry.camera import PinholeCamera
+from refusals import refused
 from yard import yard_depths, yard_from_above, yard_scene
 
+from kgs import ArgumentError
 from kgs.datasets.scene import Views
 from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
 from kgs.geometry.cameras import project, to
@@ -91,7 +93,7 @@ def test_points_lie_where_the_masks_are(views, span):
 
 def test_planes_out_of_range(views):
     for near, far in ((0.0, 1.0), (2.0, 1.0), (1.0, math.inf), (math.nan, 1.0)):
-        with pytest.raises(ValueError, match="near, far"):
+        with refused(ArgumentError, name="near, far"):
             sweep_depths(views, near, far)
 
 

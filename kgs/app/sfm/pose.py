@@ -47,7 +47,7 @@ IMAGES = "images"
 MASKS = "masks"
 MODEL = "sparse/0"
 _MODEL_FILES = ("cameras", "images", "points3D")
-SETTINGS = 9  # increased by every change after which the same photos give other files
+SETTINGS = 10  # increased by every change after which the same photos give other files
 
 
 def pose_photos(
@@ -199,7 +199,7 @@ def _new_folder(results: Results, for_fit: bool) -> Iterator[Path]:
 def find_cameras(
     opened: list[OpenPhoto], new: Path, seed: int, bar: ProgressBar, say: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Write `images`, `masks` and `sparse/0` of photos to the folder `new`; returns the report.
+    """The report on the cameras of photos, whose `images`, `masks` and `sparse/0` are written to the folder `new`.
 
     Raises:
         PhotosRefused: the photos do not fit together, or their cameras cannot be trusted.
@@ -269,7 +269,7 @@ def _say_notes(opened: list[OpenPhoto], photos: list[Photo], unsharp: list[str],
 
 
 def _write_photos(folder: Path, photos: list[Photo], names: list[str]) -> tuple[Path, Path]:
-    """Write photos and their masks; returns the folders of both. That of the masks is not there if there are none."""
+    """The folders of photos and of their masks, which are written. The second one exists if there are masks."""
     (folder / IMAGES).mkdir()
     write_images(folder / IMAGES, photos, names)
     write_masks(folder / MASKS, photos, names)
