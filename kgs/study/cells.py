@@ -52,8 +52,8 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
         data: the folder of the scenes; DataError: the scene is not there or damaged.
         lpips_weights: a folder with the weights of VGG16 and LPIPS, or None to leave LPIPS out.
     """
-    place = (cell[key] for key in ("scene", "views", "downscale", "start", "seed"))
-    scene, points, seconds = _start(data, *place, cell["fit"].get("preset", "paper"))
+    begin = (cell[key] for key in ("scene", "views", "downscale", "start", "seed"))
+    scene, points, seconds = _start(data, *begin, cell["fit"].get("preset", "paper"))
     lpips = load_lpips(lpips_weights)
     config, rival = fit_config(cell["start"], cell["seed"], cell["fit"])
     trainer, fit, result = fit_and_measure(scene, config, points, lpips, rival)
