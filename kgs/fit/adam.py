@@ -92,7 +92,7 @@ class Adam:
             group["params"][0].grad = None
 
     def state_dict(self) -> dict[str, dict[str, Tensor]]:
-        """Step and moments of each parameter by the name of its group; an empty dict before its first gradient."""
+        """Step and moments of each parameter by the name of its group, empty before its first gradient."""
         found = {}
         for group in self.param_groups:
             [parameter] = group["params"]

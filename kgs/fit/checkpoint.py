@@ -34,7 +34,7 @@ def previous(path: Path) -> Path:
 
 
 def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
-    """Write nested dicts, with text as keys, of tensors and JSON values; the file at `path` becomes the previous one.
+    """Write nested dicts, with text as keys, of tensors and JSON values. The file at `path` becomes the previous one.
 
     Whenever the process dies, and after an OSError, `newest_checkpoint` finds the old or the new state. Any other value
     is a TypeError, and a plain number that is not finite a ValueError.
@@ -70,7 +70,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def newest_checkpoint(path: Path) -> tuple[dict[str, Any], str]:
-    """The state at `path`, or else in the previous file; and what is wrong with the file at `path`, or "".
+    """The state at `path`, or else in the previous file, and what is wrong with the file at `path`, or "".
 
     If neither can be read the DataError is about the file at `path`.
     """

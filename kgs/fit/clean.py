@@ -1,4 +1,4 @@
-"""Removes floaters, giants and needles from a splat, as far as the training views do not need them.
+"""Removes floaters, oversized and elongated Gaussians from a splat, as far as the training views do not need them.
 
 Few photos leave much of a splat undetermined: a Gaussian that one photo alone shows can stand anywhere on its ray, and
 one that is long or large enough shows from elsewhere what it never had to show. From the cameras of the photos such
@@ -29,13 +29,13 @@ from .fit import Fit
 from .pruning import psnr_per_view
 from .view_renders import ViewRenders
 
-KINDS = ("giants", "needles", "floaters")
+KINDS = ("oversized", "elongated", "floaters")
 MAX_STRENGTH = 100.0
 TOLERANCE = 0.05  # dB that a training view may lose at strength 1
 # Limits at strength 1.
-GIANT = 30.0  # largest axis, over what is typical at its distance from the middle
-NEEDLE = 10.0  # largest axis over the second
-LONG = 10.0  # largest axis of a needle, over what is typical there
+OVERSIZED = 30.0  # largest axis, over what is typical at its distance from the middle
+ELONGATED = 10.0  # largest axis over the second
+LONG = 10.0  # largest axis of an elongated one, over what is typical there
 SEEN_THROUGH = 0.2  # how much farther, over its depth, the view shows something behind it
 CONFIRMED = 0.05  # how much a depth and that of the view differ at most
 NEAR = 0.3  # distance to a camera, over the 1st percentile of depths
@@ -46,26 +46,26 @@ _PARTS = 200  # the search for the number to remove ends at a 200th of the candi
 
 
 @dataclass(frozen=True, eq=False)
-class Strays:
-    """Which Gaussians of a splat are floaters, giants or needles; one may be several.
+class Artifacts:
+    """Which Gaussians of a splat are oversized, elongated or floaters. One may be several.
 
     Args:
-        giants: bool `(N,)`.
-        needles: bool `(N,)`.
+        oversized: bool `(N,)`.
+        elongated: bool `(N,)`.
         floaters: bool `(N,)`.
     """
 
-    giants: Tensor
-    needles: Tensor
+    oversized: Tensor
+    elongated: Tensor
     floaters: Tensor
 
     @property
     def any(self) -> Tensor:
         """Those of at least one kind, bool `(N,)`."""
-        return self.giants | self.needles | self.floaters
+        return self.oversized | self.elongated | self.floaters
 
     def counts(self, rows: Tensor) -> dict[str, int]:
-        """How many of the Gaussians at `rows`, bool `(N,)`, are of each kind; one of several counts for the first."""
+        """How many of the Gaussians at `rows`, bool `(N,)`, are of each kind. One of several counts for the first."""
         found = dict[str, int]()
         for kind in KINDS:
             mask: Tensor = getattr(self, kind)
@@ -76,12 +76,12 @@ class Strays:
 
 @dataclass(frozen=True, eq=False)
 class Cleaned:
-    """A fit without strays, and what was removed.
+    """A fit without artifacts, and what was removed.
 
     Args:
         fit: with the Gaussians that are left.
         removed: how many were removed, by kind.
-        needed: how many strays stay because a training view needs them.
+        needed: how many artifacts stay because a training view needs them.
         before: the PSNR of each training view before, in dB; `kgs.metrics.evaluate.BEST` stands for infinity.
         after: the same after.
     """
@@ -94,22 +94,22 @@ class Cleaned:
 
 
 @torch.no_grad()
-def find_strays(
+def find_artifacts(
     model: GaussianModel,
     strength: float = 1.0,
     cameras: PinholeCamera | None = None,
     depths: Sequence[Tensor] = (),
-) -> Strays:
-    """Find floaters, giants and needles.
+) -> Artifacts:
+    """The floaters, the oversized and the elongated Gaussians of a model.
 
     A size or spacing is typical if it is the median over the splat; at k times the median distance from the middle (the
     median of the centres), k > 1, it is k times the median, because a splat is coarser far out. With s the root of the
     strength,
 
-    - a giant has a largest axis of more than `GIANT` / s times the typical one, and k times that far out, where a few
-      large ones are the background,
-    - a needle has a largest axis of more than `NEEDLE` / s times its second, and more than `LONG` / s times the typical
-      one: short ones draw the edges of things,
+    - an oversized Gaussian has a largest axis of more than `OVERSIZED` / s times the typical one, and k times that far
+      out, where a few large ones are the background,
+    - an elongated one has a largest axis of more than `ELONGATED` / s times its second, and more than `LONG` / s times
+      the typical one: short ones draw the edges of things,
     - a floater is not confirmed by two cameras, and is seen through by one, or near one, or isolated. A camera confirms
       a Gaussian whose centre it has in its image, at a depth within `CONFIRMED` of its median depth there; it sees
       through it if its median depth is more than `SEEN_THROUGH` / s farther. Near is closer to the centre of a camera
@@ -139,8 +139,8 @@ def find_strays(
     largest = axes[:, 0]
     farther = _farther(means)
     relative = largest / (_median(largest) * farther)
-    giants = relative > GIANT / root * farther
-    needles = (largest > NEEDLE / root * axes[:, 1]) & (relative > LONG / root)
+    oversized = relative > OVERSIZED / root * farther
+    elongated = (largest > ELONGATED / root * axes[:, 1]) & (relative > LONG / root)
     spacing = _spacing(means)
     floaters = (spacing > ISOLATED / root * _median(spacing) * farther) & (spacing > APART / root * largest)
     if cameras is not None:
@@ -148,16 +148,16 @@ def find_strays(
         floaters |= (seen_through > 0) | _near(means, cameras, confirmed >= 2, NEAR * root)
         floaters &= confirmed < 2
     device = model.means.device
-    return Strays(giants.to(device), needles.to(device), floaters.to(device))
+    return Artifacts(oversized.to(device), elongated.to(device), floaters.to(device))
 
 
 def clean(fit: Fit, strength: float = 1.0, bar: ProgressBar = silent) -> Cleaned:
-    """The fit without the floaters, giants and needles that its training views do not need.
+    """The fit without the floaters, oversized and elongated Gaussians that its training views can spare.
 
-    The candidates are those of :func:`find_strays`, in the order of how much a view changes without them: the squared
-    change of its image over its squared error, in the view where that is largest. As many are removed, least first, as
-    lower the PSNR of no training view by more than `TOLERANCE` times the strength; each number that is tried is
-    rendered.
+    The candidates are those of :func:`find_artifacts`, in the order of how much a view changes without them: the
+    squared change of its image over its squared error, in the view where that is largest. As many are removed, least
+    first, as lower the PSNR of no training view by more than `TOLERANCE` times the strength; each number that is tried
+    is rendered.
 
     Args:
         fit: a splat with the cameras and photos that it was fitted to.
@@ -172,17 +172,17 @@ def clean(fit: Fit, strength: float = 1.0, bar: ProgressBar = silent) -> Cleaned
     if views.images.is_meta:
         raise ArgumentError("fit", "a scene with its photos", "one that was loaded without them")
     renders = ViewRenders(views, fit.render_with_depth)
-    strays = find_strays(fit.model, strength, views.cameras, renders.median_depths)
+    artifacts = find_artifacts(fit.model, strength, views.cameras, renders.median_depths)
     before = [*renders.psnr_per_view]
-    candidates = strays.any.nonzero()[:, 0]
-    order = candidates[_changes(fit, strays.any, before, bar).argsort()]
+    candidates = artifacts.any.nonzero()[:, 0]
+    order = candidates[_changes(fit, artifacts.any, before, bar).argsort()]
     cleaned = fit
     after = before
     low = 0
     high = len(order)
     count = high  # all of them, and then by halves
     while high - low >= max(1, len(order) // _PARTS):
-        rows = torch.ones_like(strays.any)
+        rows = torch.ones_like(artifacts.any)
         rows[order[:count]] = False
         part = replace(fit, model=fit.model.select(rows))
         levels = psnr_per_view(part)
@@ -194,9 +194,9 @@ def clean(fit: Fit, strength: float = 1.0, bar: ProgressBar = silent) -> Cleaned
             high = count - 1
         count = (low + high + 1) // 2
     check_left(len(cleaned.model))
-    removed = torch.zeros_like(strays.any)
+    removed = torch.zeros_like(artifacts.any)
     removed[order[:low]] = True
-    return Cleaned(cleaned, strays.counts(removed), len(order) - low, tuple(before), tuple(after))
+    return Cleaned(cleaned, artifacts.counts(removed), len(order) - low, tuple(before), tuple(after))
 
 
 def check_strength(strength: float) -> None:
@@ -206,13 +206,13 @@ def check_strength(strength: float) -> None:
 
 
 def check_left(count: int) -> None:
-    """Raise a ValueError if no Gaussian is left."""
+    """Raise a ValueError unless a Gaussian is left."""
     if not count:
-        raise ArgumentError("strength", "one at which a Gaussian is left", "one at which all are strays")
+        raise ArgumentError("strength", "one at which a Gaussian is left", "one at which all are artifacts")
 
 
 def _median(values: Tensor) -> Tensor:
-    """The median of some numbers; 0 of none."""
+    """The median of some numbers, 0 without any."""
     return values.median() if len(values) else values.new_zeros(())
 
 
@@ -226,7 +226,7 @@ def _farther(means: Tensor) -> Tensor:
 
 
 def _spacing(means: Tensor) -> Tensor:
-    """The root mean squared distance to the three nearest centres, `(N,)`; 0 where there is no such thing."""
+    """The root mean squared distance to the three nearest centres, `(N,)`, or 0 of too few or equal centres."""
     if len(means) <= NEIGHBOURS or bool((means == means[0]).all()):
         return means.new_zeros(len(means))
     return log_spacing(means).exp()
@@ -261,7 +261,7 @@ def _near(means: Tensor, cameras: PinholeCamera, confirmed: Tensor, share: float
 
 
 def _changes(fit: Fit, rows: Tensor, levels: Sequence[float], bar: ProgressBar) -> Tensor:
-    """How much the image of a training view changes without each of the Gaussians at `rows`, bool `(N,)`; `(M,)`.
+    """How much the image of a training view changes without each of the M Gaussians at `rows`, bool `(N,)`.
 
     The largest over the views of the squared change, summed over the pixels that count, over the mean squared error of
     the view, which its PSNR gives: `levels`. An image is affine in the opacity of one Gaussian, so its change is the
@@ -274,7 +274,7 @@ def _changes(fit: Fit, rows: Tensor, levels: Sequence[float], bar: ProgressBar) 
     with torch.no_grad():
         gaussians = fit.model()
     changes = torch.zeros_like(gaussians.opacities)
-    for i in bar(range(len(views)), "strays", "view"):
+    for i in bar(range(len(views)), "artifacts", "view"):
         camera = to(views.camera(i), fit.device)
         squares = torch.zeros_like(changes)
         for _ in range(_SIGNS):

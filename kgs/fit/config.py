@@ -47,7 +47,9 @@ DROP = 0.3  # final rate of dropping where few photos show the same surface
 
 @dataclass(frozen=True)
 class Recipe:
-    """The training recipe, written for `steps` steps; a fit of another length scales the counts and keeps the rates.
+    """The training recipe of a fit of `steps` steps.
+
+    A fit of another length scales the counts and keeps the rates.
 
     Args:
         steps: steps of the whole recipe, counted from 1; each one renders one training view.
@@ -138,8 +140,8 @@ class FitConfig:
             points are dense. same: never.
         refine_poses: optimise the poses of the training cameras too, for poses that are half a degree or more off;
             accurate ones get slightly worse. Their mean and spread stay.
-        coarse: share of the steps, from the start, that use the training views at half the width; in [0, 1]. Unless
-            given: 0, and half of them for unposed photos at the size that kgs fit chooses.
+        coarse: half-resolution warm-up: share of the steps, from the start, that use the training views at half the
+            width; in [0, 1]. Unless given: 0, and half of them for unposed photos at the size that kgs fit chooses.
         seed: of everything random: initial points, order of views, backgrounds, splits and drop masks.
         init: kind of initial points. dense: points of depth maps, made from the training images by a plane sweep in
             some seconds per view. sift: points of matched keypoints. random: random points in the space that at least
@@ -202,7 +204,7 @@ class FitConfig:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Self:
-        """The inverse of `to_dict`; ValueError where an entry is unknown or out of range."""
+        """The inverse of `to_dict`. A ValueError if an entry is unknown or out of range."""
         recipe = values.get("recipe", {}) if isinstance(values, dict) else None
         if not isinstance(recipe, dict):
             raise ArgumentError("values", f"the entries of a {cls.__name__}", quoted(values))
@@ -222,7 +224,7 @@ class SettledRecipe(Recipe):
 
 @dataclass(frozen=True, kw_only=True)
 class Settings(FitConfig):
-    """The configuration of a fit once it is settled: what a training step reads is no longer None."""
+    """The configuration of a fit once it is settled: a training step reads numbers alone."""
 
     steps: _Steps
     drop: _Rate
@@ -250,7 +252,7 @@ def min_side(config: FitConfig, lpips: bool) -> int:
 
 
 def _check(config: FitConfig | Recipe) -> None:
-    """Check each entry against its annotation; NumPy's numbers become Python's, and text becomes a path."""
+    """Check each entry against its annotation, and make NumPy's numbers Python's, and text a path."""
     hints = get_type_hints(type(config), include_extras=True)
     for entry in fields(config):
         value = getattr(config, entry.name)
@@ -265,7 +267,7 @@ def _check(config: FitConfig | Recipe) -> None:
 
 
 def _convert(value: Any, hint: Any) -> tuple[Any, str]:
-    """The value in the type of its annotation, None if it is not valid there; and what is expected, in words."""
+    """The value in the type of its annotation, or None where it is wrong, and what is expected, in words."""
     if get_origin(hint) is Literal:
         return value if isinstance(value, str) and value in get_args(hint) else None, f"one of {list(get_args(hint))}"
     if hint == Path | None:

@@ -11,7 +11,7 @@ from kgs._support.errors import ArgumentError
 
 @dataclass(frozen=True)
 class DegreeDecision:
-    """The degree of the harmonics, see :mod:`kgs.fit.view_dependence`.
+    """The degree of the harmonics, see :mod:`kgs.fit.sh_degree`.
 
     Args:
         chosen: the degree.
@@ -83,7 +83,7 @@ class PruningDecision:
 
 @dataclass(frozen=True)
 class Decisions:
-    """All that was decided about a fit; None for what was given, or is not decided yet."""
+    """All that was decided about a fit, with None for what was given."""
 
     sh_degree: DegreeDecision | None = None
     overlap: OverlapDecision | None = None
@@ -97,7 +97,7 @@ class Decisions:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Self:
-        """The inverse of :meth:`to_dict`; a ValueError, which begins with "decisions", for other values."""
+        """The inverse of :meth:`to_dict`. A ValueError about "decisions" for other values."""
         try:
             return cls(**{name: _KINDS[name](**part) for name, part in values.items()})
         except (AttributeError, KeyError, TypeError) as error:

@@ -13,7 +13,7 @@ _BOUND = 1e4  # extents: no photo tells a larger scale from this one
 
 
 def parameter_fault(model: GaussianModel) -> str:
-    """Describe the first parameter that is not finite, or overflows when it is activated; "" if there is none."""
+    """The first parameter that is NaN, infinite, or overflows when it is activated, in words, or "" if all is well."""
     for name, parameter in model.per_gaussian().items():
         row = _first_row(~torch.isfinite(parameter.detach().exp() if name == "log_scales" else parameter.detach()))
         if row is not None:
@@ -22,13 +22,13 @@ def parameter_fault(model: GaussianModel) -> str:
 
 
 def step_fault(model: GaussianModel, num_nonfinite: Tensor, loss: float) -> str:
-    """Describe parameters that made the renderer skip Gaussians, or a loss that is not finite; "" if all is well."""
+    """What made the renderer skip Gaussians, or a loss that is NaN or infinite, in words, or "" if all is well."""
     fault = parameter_fault(model) if int(num_nonfinite) else ""
     return fault or ("" if math.isfinite(loss) else f"expected a finite loss, got {loss}")
 
 
 def gradient_fault(model: GaussianModel) -> str:
-    """Describe the first gradient whose square, which Adam keeps, overflows (above 1e19); "" if there is none."""
+    """The first gradient whose square, which Adam keeps, overflows (above 1e19), in words, or "" if all is well."""
     for name, parameter in model.per_gaussian().items():
         if parameter.grad is None:
             continue
@@ -42,7 +42,7 @@ def gradient_fault(model: GaussianModel) -> str:
 
 
 def scale_fault(model: GaussianModel, extent: float) -> str:
-    """Describe the first scale above a million extents; "" if there is none."""
+    """The first scale above a million extents, in words, or "" if all is well."""
     row = _first_row(model.log_scales.detach() > math.log(_LARGEST * extent))
     if row is None:
         return ""

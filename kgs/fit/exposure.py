@@ -93,7 +93,7 @@ def _solve(weights: Tensor, logs: Tensor) -> Tensor:
 
 
 def with_exposure(scene: Scene, decisions: Decisions) -> Scene:
-    """The scene whose training views have the gains that were decided; the same one where none were.
+    """The scene with the gains of its training views that were decided, if any were.
 
     Raises:
         ValueError: they are not three numbers above 0 for each view.

@@ -98,7 +98,7 @@ class Fit:
 
     @torch.no_grad()
     def render_with_depth(self, camera: PinholeCamera, gains: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """What :meth:`render` and :meth:`median_depth` return, in one render."""
+        """What :meth:`render` returns, and the median depth of the Gaussians, `(H, W)` on the CPU, 0 in the empty."""
         image, rendering = self._render(camera, gains, "median_depth")
         return image, rendering.median_depth[0, 0].cpu()
 
@@ -113,14 +113,6 @@ class Fit:
         exposed = rendering.image * gains.to(rendering.image)[:, None, None]
         return blend(exposed, 1.0 - rendering.alpha, self._background, self._table), rendering
 
-    @torch.no_grad()
-    def median_depth(self, camera: PinholeCamera) -> Tensor:
-        """The median depth of the Gaussians from one camera, `(H, W)` on the CPU; 0 where there is nothing."""
-        gaussians = self.model(backend=self._table)
-        rendering = self._renderer(gaussians, to(camera, self.device), outputs=("median_depth",))
-        depth: Tensor = rendering.median_depth[0, 0].cpu()
-        return depth
-
     def psnr(self, views: Views) -> float | None:
-        """Mean PSNR of clamped renders over some views, in dB; None without views, or if one PSNR is infinite."""
+        """The mean PSNR of clamped renders over some views, in dB. Without views, or if one is infinite: None."""
         return mean_psnr(self.render, views)

@@ -81,7 +81,7 @@ def usual_decay(is_few: bool, steps: int) -> float:
 
 
 def steps_for(views_per_patch: float) -> int:
-    """The number of steps where so many photos show a patch, a multiple of 50; of three as in fits to three."""
+    """The number of steps where so many photos show a patch, a multiple of 50, and of three as in fits to three."""
     steps = FEW.steps + STEPS_OF_A_PHOTO * (views_per_patch - 3)
     return min(max(50 * round(steps / 50), FEW.steps), MAX_STEPS)
 

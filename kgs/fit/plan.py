@@ -18,11 +18,11 @@ from .config import FitConfig, Settings
 from .decisions import Decisions
 from .exposure import decide_exposure
 from .overlap import FEW, decide_by_overlap, usual_decay
-from .view_dependence import decide_degree
+from .sh_degree import decide_degree
 
 
 class Schedule(NamedTuple):
-    """The steps at which a fit of a given length does what it does not do in each."""
+    """The steps at which a fit of a given length does what is due only now and then."""
 
     steps: int  # all of them
     sh: tuple[int, ...]  # before these one more degree of harmonics is switched on
@@ -36,7 +36,7 @@ class Schedule(NamedTuple):
 
 @dataclass(frozen=True)
 class Plan:
-    """What is settled before a fit begins; :func:`make_plan` makes it.
+    """What is settled before a fit begins, by :func:`make_plan`.
 
     Args:
         config: the settings, none of them open.
@@ -59,7 +59,7 @@ class Plan:
 
     @classmethod
     def of(cls, config: Settings, points: int, decisions: Decisions) -> Self:
-        """The plan of a fit that begins with so many points; ValueError and ModuleNotFoundError as `make_plan`."""
+        """The plan of a fit that begins with so many points. Errors: those of :func:`check_machine`."""
         device, backend = check_machine(config)
         limit = config.max_gaussians or max(10 * config.steps, 3 * points // 2)
         return cls(config, device, backend, limit, make_schedule(config), decisions)

@@ -1,4 +1,4 @@
-"""The poses of the training cameras as parameters of a fit, for poses that are only roughly known.
+"""Pose refinement: the poses of the training cameras as parameters of a fit, where they are only roughly known.
 
 Convention:
     World-to-camera extrinsics. A motion is six numbers in a camera's own frame, as of Kornia's `Se3`: a translation in
@@ -28,8 +28,8 @@ TRANSLATION = 0.3
 LAST = 0.01  # the last learning rate, relative to the first
 
 
-class MovingPoses:
-    """The poses of V cameras as a fit refines them; each step moves one of them a little.
+class CameraOptimizer:
+    """The optimizer of the poses of V cameras, of which each step moves one a little.
 
     The gauge is fixed: the mean rotation, the mean centre and the spread of the centres stay as given, so that neither
     the splat nor a test camera has to follow.
@@ -61,7 +61,7 @@ class MovingPoses:
 
     @torch.no_grad()
     def step(self, progress: float) -> None:
-        """Move the last result of :meth:`camera`, if its gradient is finite; `progress` of the fit is in (0, 1]."""
+        """Move the last result of :meth:`camera`, if its gradient is finite, at a `progress` of the fit in (0, 1]."""
         if self._seen is None or (found := self._seen[1].grad) is None or not bool(found.isfinite().all()):
             return
         view = self._seen[0]
@@ -94,7 +94,7 @@ class MovingPoses:
         return {"extrinsics": self.extrinsics, "optimizer": self._optimizer.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a :meth:`state_dict`; a KeyError, TypeError or ValueError if an entry is missing or wrong."""
+        """Continue from a :meth:`state_dict`. A KeyError, TypeError or ValueError if an entry is missing or wrong."""
         extrinsics = state["extrinsics"]
         if extrinsics.shape != self.given.shape:
             raise ArgumentError("poses", f"extrinsics {tuple(self.given.shape)}", tuple(extrinsics.shape))

@@ -22,7 +22,7 @@ QUANTUM = 0.5 / 255  # a smaller change of an 8-bit image is not visible
 
 
 def prune(fit: Fit) -> Fit:
-    """The fit with what the training views need and no more; the same one if its settings say not to prune.
+    """The fit with what the training views need, or the same one where its settings keep all.
 
     Takes the highest limit of `WEIGHTS` that changes the PSNR of no training view by more than `TOLERANCE`, then the
     lowest degree of harmonics for which the same holds and which changes no pixel value by more than `QUANTUM`.
@@ -40,7 +40,7 @@ def prune(fit: Fit) -> Fit:
     for limit in WEIGHTS:
         rows = weights > limit
         pruned = _part(fit, rows, model.sh_degree)
-        if _is_as_good(pruned, levels):
+        if _keeps_psnr(pruned, levels):
             break
     pruned = _with_lowest_degree(fit, pruned, levels)
     kept = PruningDecision(len(model), len(pruned.model), limit, pruned.part["sh_degree"])
@@ -59,19 +59,19 @@ def _with_lowest_degree(fit: Fit, pruned: Fit, levels: list[float]) -> Fit:
     for degree in range(fit.model.sh_degree):
         lower = _part(fit, rows, degree)
         pairs = zip(lower.train_renders.images, pruned.train_renders.images, strict=True)
-        if all(bool(((one - other).abs() <= QUANTUM).all()) for one, other in pairs) and _is_as_good(lower, levels):
+        if all(bool(((one - other).abs() <= QUANTUM).all()) for one, other in pairs) and _keeps_psnr(lower, levels):
             return lower
     return pruned
 
 
-def _is_as_good(fit: Fit, levels: list[float]) -> bool:
-    """Whether no training view has another PSNR; none is rendered after one that has."""
-    renders = fit.train_renders
+def _keeps_psnr(fit: Fit, levels: list[float]) -> bool:
+    """Whether each training view has its former PSNR, to `TOLERANCE`."""
+    renders = fit.train_renders  # each made when it is asked for: none after the first that differs
     return all(abs(level - before) <= TOLERANCE for level, before in zip(renders.psnr_per_view, levels, strict=True))
 
 
 def psnr_per_view(fit: Fit) -> list[float]:
-    """The PSNR of each training view in dB, of the model as it is; `kgs.metrics.evaluate.BEST` stands for infinity."""
+    """The PSNR of each training view in dB, of the model as it is, with `kgs.metrics.evaluate.BEST` for infinity."""
     return [*ViewRenders(fit.scene.train, fit.render_with_depth).psnr_per_view]
 
 
@@ -91,7 +91,7 @@ def contributions(model: GaussianModel, views: Views, options: RasterOptions, ba
 
 
 def left_out(decisions: Decisions) -> str:
-    """What a fit left out and why, in words for its output and its page; "" if that is nothing."""
+    """What a fit left out and why, in words for its output and its page, or ""."""
     parts = []
     degree = decisions.sh_degree
     if degree is not None and degree.chosen == 0:

@@ -19,6 +19,10 @@ from .pruning import prune
 from .trainer import Trainer
 
 
+def _nothing(*_: object) -> None:
+    """The hook of a caller that adds nothing."""
+
+
 @dataclass(frozen=True)
 class Hooks:
     """What a caller adds to a fit.
@@ -33,9 +37,9 @@ class Hooks:
 
     bar: ProgressBar = silent
     make_trainer: Callable[[Scene, Plan, InitialPoints], Trainer] = Trainer
-    begun: Callable[[Trainer], None] | None = None
+    begun: Callable[[Trainer], object] = _nothing
     after_step: Callable[[Trainer, float], bool] | None = None
-    done: Callable[[Trainer, Fit], None] | None = None
+    done: Callable[[Trainer, Fit], object] = _nothing
 
 
 def fit_scene(
@@ -46,7 +50,7 @@ def fit_scene(
     resume: str | PathLike[str] | None = None,
     hooks: Hooks = Hooks(),
 ) -> Fit:
-    """Fit a scene: initial points, plan, training, pruning. Nothing is written; `kgs fit` calls it and writes a folder.
+    """Fit a scene: initial points, plan, training, pruning. `kgs fit` calls it and writes a folder.
 
     Args:
         scene: posed training and test views; the test views are rendered only for the curve.
@@ -67,16 +71,14 @@ def fit_scene(
         check_before_points(scene, config)
         points = choose_points(scene, config, hooks.bar) if points is None else points
         trainer = hooks.make_trainer(scene, make_plan(scene, config, points), points)
-    if hooks.begun is not None:
-        hooks.begun(trainer)
+    hooks.begun(trainer)
     fit = prune(trainer.fit(hooks.after_step))
-    if hooks.done is not None:
-        hooks.done(trainer, fit)
+    hooks.done(trainer, fit)
     return fit
 
 
 def check_before_points(scene: Scene, config: FitConfig, lpips: bool = False) -> None:
-    """Check what needs no initial points, which can take a minute: device, backend, and the size of the images.
+    """Check device, backend and the size of the images, before initial points take a minute.
 
     Args:
         scene: the scene to fit.

@@ -24,7 +24,7 @@ from kgs.model import PARAMETERS, GaussianModel
 from .adam import Adam
 from .config import Settings
 from .plan import Plan
-from .poses import MovingPoses
+from .poses import CameraOptimizer
 
 # for each parameter the name of its learning rate in the recipe, without `lr_`
 _LEARNING_RATES = dict(zip(PARAMETERS, ("means", "quats", "scales", "opacity", "sh_dc", "sh_rest"), strict=True))
@@ -74,7 +74,7 @@ class TrainState:
     drop: DropGaussian | None
     order: torch.Generator
     colors: torch.Generator
-    poses: MovingPoses | None
+    poses: CameraOptimizer | None
     step: int = 0
     seconds: float = 0.0
     stack: list[int] = field(default_factory=list)
@@ -127,7 +127,7 @@ class TrainState:
         )
         poses = None
         if config.refine_poses:
-            poses = MovingPoses(scene.train.cameras.extrinsics, plan.schedule.steps, start.depth)
+            poses = CameraOptimizer(scene.train.cameras.extrinsics, plan.schedule.steps, start.depth)
         return cls(
             start,
             model,
@@ -145,7 +145,7 @@ class TrainState:
             self.notes.append(text)
 
     def to_dict(self) -> dict[str, Any]:
-        """The state as nested dicts of tensors and plain values, which are not copied."""
+        """The state as nested dicts of its own tensors and plain values."""
         parts = {
             "model": self.model.state_dict(),
             "optimizer": self.optimizer.state_dict(),

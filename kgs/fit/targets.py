@@ -38,7 +38,7 @@ class Target(NamedTuple):
         return background if self.gains is None or background is None else background / self.gains[:, 0, 0]
 
     def over_background(self, background: Tensor, backend: Backend) -> Self:
-        """The view over another background, `(3,)`; the backend is that of the loss."""
+        """The view over another background, `(3,)`, with moments by the backend of the loss."""
         if self.background_weight is None:
             return self
         image = self.image + self.background_weight * (background - self.background)[:, None, None]
@@ -46,7 +46,7 @@ class Target(NamedTuple):
 
 
 class _AtMostOne(torch.autograd.Function):
-    """`clamp(max=1)`, in memory of `kgs._support.memory`; torch makes two more images in the backward pass."""
+    """`clamp(max=1)` in memory of `kgs._support.memory`, where torch makes two more images in the backward pass."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor) -> Tensor:
@@ -62,12 +62,12 @@ class _AtMostOne(torch.autograd.Function):
 
 
 def background_of(scene: Scene, device: torch.device) -> Tensor | None:
-    """The background of a scene for the renderer, `(3,)`; None for black."""
+    """The background of a scene for the renderer, `(3,)`, or None for black."""
     return scene.background.to(device, torch.float32) if scene.background.any() else None
 
 
 def targets(views: Views, background: Tensor, device: torch.device) -> list[Target]:
-    """One target for each view; `background`, `(3,)`, is that of the scene."""
+    """The targets of the views of a scene with this background, `(3,)`."""
     made = []
     for i, photo in enumerate(views.images):
         image = photo[None].to(device, torch.float32)

@@ -24,7 +24,7 @@ from kgs._support.default_device import cpu_by_default
 from kgs._support.errors import ArgumentError, TrainingDiverged
 from kgs._support.torch_threads import threads_beside
 from kgs.backends import BACKENDS, get_backend
-from kgs.datasets.scene import Scene, Views
+from kgs.datasets.scene import Scene
 from kgs.geometry.types import Gaussians, RasterOptions, Rendering
 from kgs.init_points import InitialPoints
 from kgs.losses import photometric_loss
@@ -47,7 +47,7 @@ _LOOK = 20  # steps between limits of the scales, and on a GPU between looks for
 
 
 class Trainer:
-    """Fits Gaussians to the training views of a scene; the test views are rendered only for the curve.
+    """Fits Gaussians to the training views of a scene. The test views are rendered for the curve alone.
 
     Args:
         scene: posed training and test views, of at least 6x6 pixels, 12x12 with `coarse`.
@@ -87,7 +87,7 @@ class Trainer:
             self._use(TrainState.begin(exposed, plan, points), exposed)
 
     def _use(self, state: TrainState, scene: Scene) -> None:
-        """Train on from a state; the scene has the gains that were decided."""
+        """Train on from a state, on a scene with the gains that were decided."""
         config = self.plan.config
         self.state = state
         self._backend = get_backend(self.plan.backend, self.plan.device)
@@ -134,7 +134,7 @@ class Trainer:
         return self.result()
 
     def result(self) -> Fit:
-        """The fit as far as it is; its model is the one that is trained."""
+        """The fit as far as it is, with the model that is trained."""
         state = self.state
         return Fit(
             scene=self.scene,
@@ -155,7 +155,7 @@ class Trainer:
 
     @cpu_by_default
     def train_step(self) -> float:
-        """One step and all that is due after it (curve, densification, reset of the opacities); returns the loss.
+        """The loss of one step, which is done with all that is due after it: curve, densification, reset of opacities.
 
         On a GPU the loss is that of the last of every 20 steps: reading a number waits until all work is done.
 
@@ -200,14 +200,6 @@ class Trainer:
         recipe = self.plan.config.recipe
         return photometric_loss(image, view.image, recipe.dssim_weight, moments=view.moments, backend=self._backend)
 
-    def render(self, camera: PinholeCamera) -> Tensor:
-        """Render all Gaussians from one camera before the background of the scene, `(1, 3, H, W)`."""
-        return self.result().render(camera)
-
-    def psnr(self, views: Views) -> float | None:
-        """Mean PSNR of clamped renders over some views, in dB; None without views, or if one PSNR is infinite."""
-        return self.result().psnr(views)
-
     def state_dict(self) -> dict[str, Any]:
         """The state, and what it belongs to: nested dicts of tensors and plain values, copied."""
         return copy.deepcopy(self._state_dict())
@@ -245,7 +237,7 @@ class Trainer:
         self._use(state, exposed)
 
     def save(self, path: str | PathLike[str], part: dict[str, Any] | None = None) -> None:
-        """Write a checkpoint; after an OSError one that was there is still there.
+        """Write a checkpoint. After an OSError one that was there is still there.
 
         Args:
             path: the file to write.
@@ -290,7 +282,7 @@ class Trainer:
         return trainer
 
     def _optimize(self) -> float:
-        """Render a training view, compare it with its photo, and move the parameters; returns the loss."""
+        """The loss of a training view, by whose gradients the parameters are moved."""
         state = self.state
         config = self.plan.config
         steps = self.plan.schedule.steps

@@ -52,5 +52,5 @@ class ViewRenders:
 
     @property
     def psnr_per_view(self) -> Iterator[float]:
-        """PSNR of each view in dB, rounded to 4 digits; `kgs.metrics.evaluate.BEST` stands for infinity."""
+        """The PSNR of each view in dB, rounded to 4 digits, with `kgs.metrics.evaluate.BEST` for infinity."""
         return (clipped_psnr(round(view_psnr(image, self._views, i), 4)) for i, image in enumerate(self.images))

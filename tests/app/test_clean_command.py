@@ -8,7 +8,7 @@ from kgs import GaussianModel, load_ply, save_ply
 
 
 def planted(path, out, offset=0.0):
-    """The splat with a giant of degree 1 that hardly shows, all of it shifted."""
+    """The splat with an oversized Gaussian of degree 1 that hardly shows, all of it shifted."""
     model = load_ply(path)
     values = {name: value.detach().clone() for name, value in model.named_parameters()}
     extra = {name: value[:1].clone() for name, value in values.items()}
@@ -48,7 +48,7 @@ def test_a_file_keeps_its_degree_and_its_tag(fitted, folder, tmp_path, capsys):
     model = planted(fitted / "splat.ply", tmp_path / "planted.ply")
     assert run("clean", tmp_path / "planted.ply", "--cameras", folder, "-o", tmp_path / "clean.ply") == 0
     said = capsys.readouterr().out
-    assert "1 giant," in said
+    assert "1 oversized," in said
     assert "train: PSNR" in said
     cleaned = load_ply(tmp_path / "clean.ply")
     assert (cleaned.sh_degree, cleaned.antialiased) == (1, True)

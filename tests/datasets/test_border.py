@@ -101,7 +101,7 @@ def test_a_fit_renders_the_scene_without_the_border(scene):
             views, make_plan(views, FitConfig(steps=200, evaluations=1, training_background="scene"), points), points
         )
         trainer.fit()
-        edges.append(float(trainer.render(scene.train.camera(0))[..., :2].mean()))
+        edges.append(float(trainer.result().render(scene.train.camera(0))[..., :2].mean()))
     assert edges[1] == pytest.approx(edges[0], abs=0.1)
     assert edges[2] < edges[1] - 0.1
 

@@ -78,7 +78,7 @@ def test_a_fit_learns_grows_and_repeats_bit_for_bit(device, scene, points, confi
     assert len(first.model) > len(points.points)
     assert (
         first.state.curve[-1]["train_psnr"]
-        > Trainer(scene, make_plan(scene, config, points), points).psnr(scene.train) + 1
+        > Trainer(scene, make_plan(scene, config, points), points).result().psnr(scene.train) + 1
     )
     assert_same_bits(first, second)
 
@@ -86,7 +86,7 @@ def test_a_fit_learns_grows_and_repeats_bit_for_bit(device, scene, points, confi
 def test_a_fit_is_near_the_one_on_the_cpu(scene, points, config):
     here, there = (fitted(scene, points, x, 10) for x in (replace(CONFIG, device="cpu"), config))
     assert len(here.model) == len(there.model)
-    assert abs(here.psnr(scene.test) - there.psnr(scene.test)) < 0.1
+    assert abs(here.result().psnr(scene.test) - there.result().psnr(scene.test)) < 0.1
 
 
 def test_a_fit_resumes_bit_for_bit_and_goes_to_the_cpu_and_back(device, scene, points, config, tmp_path):

@@ -1,4 +1,4 @@
-"""Floaters, giants and needles: planted ones are found and nothing else is, and no training view gets worse."""
+"""Floaters, oversized and elongated Gaussians: planted ones alone are found, and no training view gets worse."""
 
 import math
 from dataclasses import replace
@@ -11,7 +11,7 @@ from refusals import refused
 from kgs import ArgumentError, GaussianModel, pinhole_cameras
 from kgs.datasets.scene import Scene, Views
 from kgs.fit import Fit
-from kgs.fit.clean import TOLERANCE, check_left, clean, find_strays
+from kgs.fit.clean import TOLERANCE, check_left, clean, find_artifacts
 from kgs.geometry.cameras import posed
 from kgs.geometry.types import RasterOptions
 
@@ -59,17 +59,17 @@ def as_fit(model, photos_of=None):
     return replace(fit, scene=replace(scene, train=replace(views, images=photos)))
 
 
-def strays_of(fit, strength=1.0):
+def artifacts_of(fit, strength=1.0):
     views = fit.scene.train
-    depths = [fit.median_depth(views.camera(i)) for i in range(len(views))]
-    return find_strays(fit.model, strength, views.cameras, depths)
+    depths = [fit.render_with_depth(views.camera(i))[1] for i in range(len(views))]
+    return find_artifacts(fit.model, strength, views.cameras, depths)
 
 
 BEFORE_ONE_CAMERA = ((1.0, 0.0, 1.0), (0.06, 0.06, 0.06), 0.99)
 NEAR_A_CAMERA = ((0.0, 0.5, 0.2), (0.02, 0.02, 0.02), 0.5)  # outside of all images
 ISOLATED = ((0.0, 0.0, 40.0), (0.1, 0.1, 0.1), 0.5)  # behind the wall
-GIANT = ((0.5, 0.0, 4.0), (4.0, 3.0, 0.01), 0.3)
-NEEDLE = ((-0.5, 0.0, 4.0), (1.5, 0.02, 0.01), 0.3)
+OVERSIZED = ((0.5, 0.0, 4.0), (4.0, 3.0, 0.01), 0.3)
+ELONGATED = ((-0.5, 0.0, 4.0), (1.5, 0.02, 0.01), 0.3)
 
 
 @pytest.mark.parametrize(
@@ -78,48 +78,48 @@ NEEDLE = ((-0.5, 0.0, 4.0), (1.5, 0.02, 0.01), 0.3)
         (BEFORE_ONE_CAMERA, "floaters"),
         (NEAR_A_CAMERA, "floaters"),
         (ISOLATED, "floaters"),
-        (GIANT, "giants"),
-        (NEEDLE, "needles"),
+        (OVERSIZED, "oversized"),
+        (ELONGATED, "elongated"),
     ],
 )
 def test_what_is_planted_before_a_wall_is_found_and_no_other(planted, kind):
-    strays = strays_of(as_fit(wall(planted)))
-    assert strays.any.nonzero().tolist() == [[SIDE**2]]
-    found = {name: int(getattr(strays, name).sum()) for name in ("giants", "needles", "floaters")}
-    assert found == {"giants": 0, "needles": 0, "floaters": 0} | {kind: 1}
-    assert strays.counts(strays.any) == found
+    artifacts = artifacts_of(as_fit(wall(planted)))
+    assert artifacts.any.nonzero().tolist() == [[SIDE**2]]
+    found = {name: int(getattr(artifacts, name).sum()) for name in ("oversized", "elongated", "floaters")}
+    assert found == {"oversized": 0, "elongated": 0, "floaters": 0} | {kind: 1}
+    assert artifacts.counts(artifacts.any) == found
 
 
 def test_of_a_wall_nothing_is_removed():
     fit = as_fit(wall())
-    assert not bool(strays_of(fit).any.any())
-    assert not bool(find_strays(fit.model).any.any())
+    assert not bool(artifacts_of(fit).any.any())
+    assert not bool(find_artifacts(fit.model).any.any())
     cleaned = clean(fit)
     assert (len(cleaned.fit.model), cleaned.needed) == (SIDE**2, 0)
     assert cleaned.before == cleaned.after
 
 
-def test_without_cameras_giants_needles_and_the_isolated_are_found():
-    model = wall(BEFORE_ONE_CAMERA, ISOLATED, GIANT, NEEDLE)
-    strays = find_strays(model)
-    rows = {kind: getattr(strays, kind).nonzero()[:, 0].sub(SIDE**2).tolist() for kind in ("giants", "needles")}
-    assert rows == {"giants": [2], "needles": [3]}
-    assert 1 in strays.floaters.nonzero()[:, 0] - SIDE**2
+def test_without_cameras_oversized_elongated_and_the_isolated_are_found():
+    model = wall(BEFORE_ONE_CAMERA, ISOLATED, OVERSIZED, ELONGATED)
+    artifacts = find_artifacts(model)
+    rows = {kind: getattr(artifacts, kind).nonzero()[:, 0].sub(SIDE**2).tolist() for kind in ("oversized", "elongated")}
+    assert rows == {"oversized": [2], "elongated": [3]}
+    assert 1 in artifacts.floaters.nonzero()[:, 0] - SIDE**2
 
 
 def test_what_two_cameras_confirm_is_no_floater():
     """A blob in the middle, before the wall: both its neighbours see it at its own depth."""
     blob = ((0.0, 0.0, 2.0), (0.2, 0.2, 0.2), 0.99)
     crowd = [((0.1 * k, 0.05, 2.0), (0.2, 0.2, 0.02), 0.99) for k in range(-3, 4)]
-    assert not bool(strays_of(as_fit(wall(blob, *crowd))).floaters[SIDE**2 :].any())
+    assert not bool(artifacts_of(as_fit(wall(blob, *crowd))).floaters[SIDE**2 :].any())
 
 
 def test_a_larger_strength_finds_all_that_a_smaller_one_does():
-    model = wall(BEFORE_ONE_CAMERA, ISOLATED, GIANT, NEEDLE, ((0.0, 1.0, 4.0), (0.5, 0.08, 0.01), 0.5))
+    model = wall(BEFORE_ONE_CAMERA, ISOLATED, OVERSIZED, ELONGATED, ((0.0, 1.0, 4.0), (0.5, 0.08, 0.01), 0.5))
     counts = []
     before = torch.zeros(len(model), dtype=torch.bool)
     for strength in (0.25, 1.0, 4.0, 25.0):
-        found = strays_of(as_fit(model), strength).any
+        found = artifacts_of(as_fit(model), strength).any
         assert bool((found | ~before).all())
         before = found
         counts.append(int(found.sum()))
@@ -128,7 +128,7 @@ def test_a_larger_strength_finds_all_that_a_smaller_one_does():
 
 @pytest.mark.parametrize("strength", [1.0, 8.0])
 def test_no_training_view_loses_more_than_the_bound(each_backend, strength):
-    """The photos show the floater, so it is needed; the needle behind the wall is not."""
+    """The photos show the floater, so it is needed; the elongated Gaussian behind the wall is not."""
     behind = ((-0.5, 0.0, 4.3), (1.5, 0.02, 0.01), 0.3)
     fit = as_fit(wall(BEFORE_ONE_CAMERA, behind))
     cleaned = clean(fit, strength)
@@ -144,14 +144,14 @@ def test_no_training_view_loses_more_than_the_bound(each_backend, strength):
 def test_a_floater_that_the_photos_do_not_show_is_removed_and_the_view_gets_better():
     fit = as_fit(wall(BEFORE_ONE_CAMERA), photos_of=wall())
     cleaned = clean(fit)
-    assert cleaned.removed == {"giants": 0, "needles": 0, "floaters": 1}
+    assert cleaned.removed == {"oversized": 0, "elongated": 0, "floaters": 1}
     assert cleaned.after[2] > cleaned.before[2] + 0.5
     assert len(fit.model) == SIDE**2 + 1
 
 
 @pytest.mark.parametrize("strength", [0.0, -1.0, math.nan, math.inf, 101.0])
 def test_a_wrong_strength_is_refused(strength):
-    for call in (lambda: find_strays(wall(), strength), lambda: clean(as_fit(wall()), strength)):
+    for call in (lambda: find_artifacts(wall(), strength), lambda: clean(as_fit(wall()), strength)):
         with refused(ArgumentError, name="strength"):
             call()
 
@@ -161,7 +161,7 @@ def test_no_photos_too_few_depths_and_no_gaussian_left_are_refused():
     without_photos = replace(fit.scene.train, images=fit.scene.train.images.to("meta"))
     for name, call in (
         ("fit", lambda: clean(replace(fit, scene=replace(fit.scene, train=without_photos)))),
-        ("depths", lambda: find_strays(wall(), 1.0, views_of_a_wall().cameras, [torch.ones(SIZE)])),
+        ("depths", lambda: find_artifacts(wall(), 1.0, views_of_a_wall().cameras, [torch.ones(SIZE)])),
         ("strength", lambda: check_left(0)),
     ):
         with refused(ArgumentError, name=name):
@@ -169,15 +169,15 @@ def test_no_photos_too_few_depths_and_no_gaussian_left_are_refused():
 
 
 @pytest.mark.parametrize("n", [0, 1, 3, 4])
-def test_a_few_gaussians_in_one_place_are_no_strays(n):
+def test_a_few_gaussians_in_one_place_are_no_artifacts(n):
     model = wall()
     with torch.no_grad():
         model.means.copy_(torch.tensor([0.0, 0.0, 4.0]).expand(SIDE**2, 3))
-    assert not bool(find_strays(model.select(torch.arange(n))).any.any())
+    assert not bool(find_artifacts(model.select(torch.arange(n))).any.any())
 
 
 def test_a_camera_that_sees_no_gaussian_decides_nothing(each_backend):
-    fit = as_fit(wall(NEEDLE))
+    fit = as_fit(wall(ELONGATED))
     views = fit.scene.train
     turned = views.cameras.extrinsics.clone()
     turned[1] = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])) @ turned[1]

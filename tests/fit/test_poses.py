@@ -21,7 +21,7 @@ from kgs.datasets import load_scene, synthetic_scene
 from kgs.fit import FitConfig, Trainer
 from kgs.fit.checkpoint import load_checkpoint, save_checkpoint
 from kgs.fit.plan import make_plan
-from kgs.fit.poses import REACH, MovingPoses, decayed, with_extrinsics
+from kgs.fit.poses import REACH, CameraOptimizer, decayed, with_extrinsics
 from kgs.fit.run import choose_points
 from kgs.geometry.rigs import camera_centers
 
@@ -73,7 +73,7 @@ def test_cameras_follow_their_gradient(room):
     given = room.train.cameras.extrinsics
     wrong = turned(given, 0.15, seed=1)  # within reach
     scene = with_extrinsics(room, wrong)
-    poses = MovingPoses(scene.train.cameras.extrinsics, steps=600, depth=DEPTH)
+    poses = CameraOptimizer(scene.train.cameras.extrinsics, steps=600, depth=DEPTH)
     scene = pulled(poses, scene, given, 600)
     assert degrees_apart(wrong, given) > 0.15
     assert degrees_apart(scene.train.cameras.extrinsics, given) < 0.02
@@ -82,7 +82,7 @@ def test_cameras_follow_their_gradient(room):
 
 def test_what_cameras_have_in_common_stays(room):
     given = room.train.cameras.extrinsics
-    poses = MovingPoses(given, steps=30, depth=DEPTH)
+    poses = CameraOptimizer(given, steps=30, depth=DEPTH)
     pulled(poses, room, turned(given, 20.0, seed=2), 30)
     for now, before in zip(in_common(poses.extrinsics), in_common(given), strict=True):
         torch.testing.assert_close(now, before, rtol=0, atol=1e-6)
@@ -94,7 +94,7 @@ def test_what_cameras_have_in_common_stays(room):
 def test_none_goes_farther_than_its_reach(room):
     """However steep: a gradient of 1e12, on the way to 90 degrees."""
     given = room.train.cameras.extrinsics
-    poses = MovingPoses(given, steps=90, depth=DEPTH)
+    poses = CameraOptimizer(given, steps=90, depth=DEPTH)
     for step in range(90):
         camera = poses.camera(room.train.camera(step % 3), step % 3)
         (1e12 * camera.extrinsics[0, 0, 2]).backward()
@@ -108,7 +108,7 @@ def test_none_goes_farther_than_its_reach(room):
 
 @pytest.mark.parametrize("slope", [math.nan, math.inf, None])
 def test_no_step_without_a_finite_gradient(room, slope):
-    poses = MovingPoses(room.train.cameras.extrinsics, steps=5, depth=DEPTH)
+    poses = CameraOptimizer(room.train.cameras.extrinsics, steps=5, depth=DEPTH)
     camera = poses.camera(room.train.camera(0), 0)
     if slope is not None:
         (slope * camera.extrinsics.sum()).backward()

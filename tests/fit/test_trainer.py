@@ -37,7 +37,7 @@ def test_it_learns(whole, scene, points):
     curve = whole.state.curve
     assert [point["step"] for point in curve] == [10, 20, 30]
     assert curve[-1]["train_psnr"] > curve[0]["train_psnr"]
-    assert curve[-1]["train_psnr"] > begun(scene, points).psnr(scene.train) + 1
+    assert curve[-1]["train_psnr"] > begun(scene, points).result().psnr(scene.train) + 1
     assert all(a["seconds"] < b["seconds"] for a, b in pairwise(curve))
 
 
@@ -204,7 +204,7 @@ def test_rates_that_are_far_too_high_end_finite_or_in_an_error(scene, points, fa
     with contextlib.suppress(TrainingDiverged):
         trainer.fit()
     assert all(torch.isfinite(value).all() for value in parameters(trainer).values())
-    assert math.isfinite(trainer.psnr(scene.train))
+    assert math.isfinite(trainer.result().psnr(scene.train))
 
 
 def test_the_memory_budget_reaches_the_renderer(scene, points):
@@ -220,7 +220,7 @@ def test_the_drop_rate_rises_to_the_end_and_renders_and_the_last_tenth_drop_noth
     def note(trainer, _):
         rates.append(trainer.state.drop.rate)
         active.append(trainer.state.drop.training)
-        assert torch.equal(*(trainer.render(scene.train.camera(0)) for _ in range(2)))  # of all Gaussians
+        assert torch.equal(*(trainer.result().render(scene.train.camera(0)) for _ in range(2)))  # of all Gaussians
 
     trainer.fit(note)
     assert rates == pytest.approx([0.3 * step / 20 for step in range(1, 21)])

@@ -1,10 +1,10 @@
-"""`kgs clean`: a splat without floaters, giants and needles."""
+"""`kgs clean`: a splat without floaters, oversized and elongated Gaussians."""
 
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kgs._support.errors import ArgumentError, DataError, printable, quantity
+from kgs._support.errors import ArgumentError, DataError, printable
 from kgs.app.console import VIEWER, as_line, each, say, say_next
 from kgs.fit.config import Backend, Background
 
@@ -33,10 +33,10 @@ def clean(
     device: str = "auto",
     backend: Backend = "auto",
 ) -> None:
-    """Remove floaters, giants and needles from a splat: what shows from beside the photos alone.
+    """Remove floaters, oversized and elongated Gaussians from a splat: what shows from beside the photos alone.
 
-    A floater is a Gaussian that one photo shows and another sees through, or one near a camera, or an isolated one; a
-    giant is far larger than the others; a needle is long and thin. Each photo is rendered before and after: what is
+    A floater is a Gaussian that one photo shows and another sees through, or one near a camera, or an isolated one.
+    Each photo is rendered before and after: what is
     removed lowers the PSNR of none by more than 0.05 dB times the strength.
 
     For example:
@@ -72,7 +72,7 @@ def clean(
     torch_device = load_tools(device, backend)
 
     from kgs.app.saved_fit import load_fit
-    from kgs.fit.clean import check_left, check_strength, find_strays
+    from kgs.fit.clean import check_left, check_strength, find_artifacts
     from kgs.fit.clean import clean as clean_fit
     from kgs.ply import save_ply
 
@@ -95,13 +95,13 @@ def clean(
     else:
         whole, offset = _load_alone(splat)
         _check_some(splat, whole)
-        strays = find_strays(whole, strength)
-        model = whole.select(~strays.any)
+        artifacts = find_artifacts(whole, strength)
+        model = whole.select(~artifacts.any)
         check_left(len(model))
-        removed = strays.counts(strays.any)
+        removed = artifacts.counts(artifacts.any)
         fitted = len(whole)
     save_ply(out, model, offset=offset)
-    kinds = ", ".join(quantity(count, kind.removesuffix("s")) for kind, count in removed.items())
+    kinds = ", ".join(f"{count} {kind}" for kind, count in removed.items())
     say(f"{printable(out)}: {len(model)} of {fitted} Gaussians; removed: {kinds}")
     if fit is None:
         say("no photo was compared, and floaters are the isolated ones alone: --cameras SCENE names the photos")

@@ -9,10 +9,10 @@ import pytest
 import torch
 from yard import yard_depths
 
-from kgs.fit import FitConfig, InitialPoints, view_dependence
+from kgs.fit import FitConfig, InitialPoints, sh_degree
 from kgs.fit.plan import make_plan
 from kgs.fit.run import choose_points
-from kgs.fit.view_dependence import MIN_GAIN, harmonics_kernel, possible_gain, without_exposure
+from kgs.fit.sh_degree import MIN_GAIN, harmonics_kernel, possible_gain, without_exposure
 from kgs.geometry.cameras import to
 from kgs.geometry.harmonics import harmonics_basis
 from kgs.geometry.multiview import unproject
@@ -55,14 +55,14 @@ def made_up(patches=1200, views=VIEWS, size=0.0, noise=0.0, exposure=0.0, spread
 @pytest.mark.parametrize("noise", [0.002, 0.02, 0.08])
 @pytest.mark.parametrize("exposure", [0.0, 0.2])
 @pytest.mark.parametrize("outliers", [0.0, 0.1])
-def test_noise_exposures_and_outliers_are_no_view_dependence(noise, exposure, outliers):
+def test_noise_exposures_and_outliers_are_no_sh_degree(noise, exposure, outliers):
     assert possible_gain(made_up(noise=noise, exposure=exposure, outliers=outliers)) < 0.25 * MIN_GAIN
 
 
 @pytest.mark.parametrize("noise", [0.002, 0.02])
 @pytest.mark.parametrize("exposure", [0.0, 0.2])
 @pytest.mark.parametrize("outliers", [0.0, 0.1])
-def test_harmonics_are_view_dependence(noise, exposure, outliers):
+def test_harmonics_are_sh_degree(noise, exposure, outliers):
     assert possible_gain(made_up(size=0.05, noise=noise, exposure=exposure, outliers=outliers)) > MIN_GAIN
 
 
@@ -83,14 +83,14 @@ def test_the_kernel_is_the_covariance_of_harmonics():
 def test_errors_are_those_of_leaving_each_view_out():
     patches = made_up(6, noise=0.1)
     kernel = harmonics_kernel(patches.directions)
-    found = iter(view_dependence._errors(patches.colors, patches.visible, kernel).numpy())
+    found = iter(sh_degree._errors(patches.colors, patches.visible, kernel).numpy())
     for colors, visible, covariance in zip(
         *(x.double().numpy() for x in (patches.colors, patches.visible, kernel)), strict=True
     ):
         rows = np.flatnonzero(visible)
         for row in rows:
             others = rows[rows != row]
-            prior = covariance + view_dependence.FLAT_PRIOR
+            prior = covariance + sh_degree.FLAT_PRIOR
             weights = np.linalg.solve(prior[np.ix_(others, others)] + np.eye(len(others)), prior[others, row])
             np.testing.assert_allclose(next(found), colors[row] - weights @ colors[others], atol=1e-6)
     assert next(found, None) is None
@@ -160,7 +160,7 @@ def as_points(patches, kind="dense"):
 
 @pytest.mark.parametrize(("gain", "degree"), [(MIN_GAIN + 0.01, 3), (MIN_GAIN - 0.01, 0), (-1.0, 0)])
 def test_harmonics_have_to_gain_enough(monkeypatch, scene, gain, degree):
-    monkeypatch.setattr(view_dependence, "possible_gain", lambda _: gain)
+    monkeypatch.setattr(sh_degree, "possible_gain", lambda _: gain)
     patches = made_up()
     plan = make_plan(scene, OPEN, as_points(patches))
     assert (plan.config.sh_degree, len(plan.schedule.sh)) == (degree, degree)

@@ -1,4 +1,4 @@
-"""Decides before a fit, from the photos alone, whether the colours of a scene depend on the direction.
+"""Selects the degree of the spherical harmonics before a fit: whether colours depend on the direction, by the photos.
 
 Dense initial points come with the colours of small patches of surface in the views that agree on their depth. Each of
 these colours is predicted from those of the other views: once as their mean, once by harmonics of degree 3, whose
@@ -46,7 +46,7 @@ def decide_degree(points: InitialPoints) -> DegreeDecision:
 
 
 def possible_gain(patches: PatchColors) -> float:
-    """By how many dB harmonics can raise a fit of `TYPICAL` dB; negative where they predict worse than the mean."""
+    """By how many dB harmonics can raise a fit of `TYPICAL` dB, below 0 where they predict worse than the mean."""
     rows = select_evenly(len(patches), min(len(patches), MAX_PATCHES))
     visible = patches.visible[rows]
     colors = _without_outliers(without_exposure(patches.colors, patches.visible)[rows], visible)
@@ -89,7 +89,7 @@ def _without_outliers(colors: Tensor, visible: Tensor) -> Tensor:
 
 
 def harmonics_kernel(directions: Tensor) -> Tensor:
-    """The covariance `(P, V, V)` of harmonics of degree 1 to 3 in unit directions `(P, V, 3)`; the variance is 1.
+    """The covariance `(P, V, V)` of harmonics of degree 1 to 3 in unit directions `(P, V, 3)`, with a variance of 1.
 
     By the addition theorem it is a sum of Legendre polynomials of the cosine, weighted by the 2 l + 1 coefficients of
     each degree l.
