@@ -2,7 +2,6 @@
 
 import platform
 from importlib.util import find_spec
-from typing import NamedTuple
 
 import torch
 
@@ -32,14 +31,6 @@ _EXTRAS = {
 _NO_TRITON = {"mps": "Apple's GPUs have no Triton, and kgs has not been tried on them: use --device cpu"}
 
 
-class _Result(NamedTuple):
-    """How a backend does on a device: error, milliseconds by count, and what is wrong, "" if nothing is."""
-
-    error: float
-    milliseconds: list[float]
-    wrong: str
-
-
 def check(*, device: str | None = None) -> int:
     """Print versions, devices and backends: how far each is from the reference, and how fast; 1 if anything is wrong.
 
@@ -62,9 +53,9 @@ def check(*, device: str | None = None) -> int:
         print(f"{each}: {_describe(each)}")
         taken = get_backend("auto", each).name
         for backend in BACKENDS.values():
-            result = _examine(backend, each) if _is_there(backend, each) else _Result(0.0, [], "")
-            faults += bool(result.wrong)
-            print(f"  {backend.name:<22}{_row(backend, each, result, backend.name == taken)}")
+            said, works = _examine(backend, each)
+            faults += not works
+            print(f"  {backend.name:<22}{said}{'   auto takes it' if works and backend.name == taken else ''}")
     print(f"\noff by: from the reference in float64, image and gradients, 300 Gaussians; expected at most {BOUND:g}")
     print(f"10 000, 50 000: Gaussians; a training step at {SIZE[1]}x{SIZE[0]} without densification")
     missing = {extra: of for extra, of in _EXTRAS.items() if find_spec(of[0]) is None}
@@ -75,12 +66,9 @@ def check(*, device: str | None = None) -> int:
 
 def _devices() -> list[torch.device]:
     """The CPU, and all GPUs that torch can use."""
-    devices = [torch.device("cpu")]
-    if torch.cuda.is_available():
-        devices += [torch.device("cuda", i) for i in range(torch.cuda.device_count())]
-    if torch.xpu.is_available():
-        devices += [torch.device("xpu", i) for i in range(torch.xpu.device_count())]
-    return devices
+    gpus = [("cuda", torch.cuda), ("xpu", torch.xpu)]
+    counts = {kind: of.device_count() for kind, of in gpus if of.is_available()}
+    return [torch.device("cpu"), *(torch.device(kind, i) for kind, count in counts.items() for i in range(count))]
 
 
 def _describe(device: torch.device) -> str:
@@ -94,49 +82,33 @@ def _describe(device: torch.device) -> str:
     return device.type
 
 
-def _is_there(backend: Backend, device: torch.device) -> bool:
-    return backend.runs_on(device) and backend.is_installed() and (device.type, backend.name) != ("cpu", "triton")
-
-
-def _examine(backend: Backend, device: torch.device) -> _Result:
-    """Agreement and times; what is wrong in one line."""
+def _examine(backend: Backend, device: torch.device) -> tuple[str, bool]:
+    """Error and times of a backend in a line, or why there are none; and whether it works where it should."""
+    if backend.runs_on(device) and not backend.is_installed():
+        package, how = backend.package or ("", "")
+        return f"not installed: {package}; {how}", True
+    if not backend.runs_on(device) or (device.type, backend.name) == ("cpu", "triton"):
+        return f"not for {device.type}", True
     try:
-        off = _off_by(backend.name, device)
-        if backend.name != "torch":
-            off = max(off, largest_error(backend, device))
-        milliseconds = [1e3 * _seconds(count, backend.name, device) for count in COUNTS]
+        off = _off_by(backend, device)
+        cases = (Cases(count, SIZE, device, backend.name) for count in COUNTS)
+        seconds = [take_turns({"step": case.train}, 3, device)["step"].wall for case in cases]
     except Exception as error:  # whatever a compiler, a driver or a broken package does
-        return _Result(float("nan"), [], cause_of(error))
-    wrong = "" if off <= BOUND else f"expected at most {BOUND:g}"
-    return _Result(off, milliseconds, wrong)
+        return f"WRONG: {cause_of(error)}", False
+    if not off <= BOUND:  # NaN
+        return f"WRONG: expected at most {BOUND:g} (off by {off:.1e})", False
+    return f"{off:>9.1e}" + "".join(f"{1e3 * value:>8.1f} ms" for value in seconds), True
 
 
-def _off_by(backend: str, device: torch.device) -> float:
-    """The largest error of image and gradients against the dense reference."""
+def _off_by(backend: Backend, device: torch.device) -> float:
+    """The largest error of image and gradients against the dense reference, and of each stage against torch's."""
     model, camera = layered_scene(300, (48, 64))
     scene = (model(), camera)
     image, slopes = exact(scene, RasterOptions.near_plane)
     gaussians, camera = cast(scene, torch.float32)
-    renderer = GaussianRenderer(backend=backend, alpha_threshold=0.0, transmittance_stop=0.0)
+    renderer = GaussianRenderer(backend=backend.name, alpha_threshold=0.0, transmittance_stop=0.0)
     drawn = renderer(gaussians.to(device), to(camera, device)).image.cpu()
-    errors = relative_errors(gradients(drawn, gaussians), slopes)
-    return max(float((drawn - image).detach().abs().max()), float(errors.max()))
-
-
-def _seconds(count: int, backend: str, device: torch.device) -> float:
-    """A training step."""
-    cases = Cases(count, SIZE, device, backend)
-    return take_turns({"step": cases.train}, 3, device)["step"].wall
-
-
-def _row(backend: Backend, device: torch.device, result: _Result, taken: bool) -> str:
-    """The line of a backend, without its name."""
-    if result.wrong:
-        return f"WRONG: {result.wrong}" + (f" (off by {result.error:.1e})" if result.milliseconds else "")
-    if not result.milliseconds:
-        package, how = backend.package or ("", "")
-        if backend.runs_on(device) and not backend.is_installed():
-            return f"not installed: {package}; {how}"
-        return f"not for {device.type}"
-    times = "".join(f"{value:>8.1f} ms" for value in result.milliseconds)
-    return f"{result.error:>9.1e}{times}{'   auto takes it' if taken else ''}"
+    of_image = (drawn - image).detach().abs().max()
+    of_gradients = relative_errors(gradients(drawn, gaussians), slopes).max()
+    of_stages = 0.0 if backend.name == "torch" else largest_error(backend, device)
+    return float(torch.tensor([of_image, of_gradients, of_stages]).max())  # NaN stays

@@ -172,11 +172,11 @@ def _find(rows: list[Row], scene: str, setting: Setting) -> Row:
 
 
 def _markdown(rows: list[Row]) -> str:
-    lines: dict[str, list[str]] = {row["scene"]: [] for row in rows}
-    for scene, line in lines.items():
+    lines = []
+    for scene in dict.fromkeys(row["scene"] for row in rows):
         of_scene = [_find(rows, scene, setting) for setting in _COLUMNS.values()]
-        line += [scene, *(f"{row['max_error']:.1e} / {row['gradient']:.1e}" for row in of_scene)]
-    return markdown_table("Largest error: image / gradient, relative to its largest value", _COLUMNS, lines.values())
+        lines.append([scene, *(f"{row['max_error']:.1e} / {row['gradient']:.1e}" for row in of_scene)])
+    return markdown_table("Largest error: image / gradient, relative to its largest value", _COLUMNS, lines)
 
 
 def _plot(path: Path, rows: list[Row], error: str, seconds: str, label: str) -> None:

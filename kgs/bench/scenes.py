@@ -83,11 +83,8 @@ def exact(scene: Scene, near_plane: float) -> tuple[Tensor, dict[str, Tensor]]:
 
 def relative_errors(got: dict[str, Tensor], expected: dict[str, Tensor]) -> Tensor:
     """The largest error of each parameter's gradient over its largest value, `(5,)` float64; NaN stays."""
-    errors = []
-    for name in PARAMETERS:
-        error = (got[name] - expected[name]).abs().max() / expected[name].abs().max()
-        errors.append(error.double())
-    return torch.stack(errors)
+    errors = [(got[name] - expected[name]).abs().max() / expected[name].abs().max() for name in PARAMETERS]
+    return torch.stack(errors).double()
 
 
 def check_scenes(data: Path, scenes: Iterable[str]) -> None:

@@ -70,18 +70,10 @@ def speed(*, out: Path, quick: bool = False, device: str = "cpu") -> None:
                 times_of = time_parts(cases.stages, repeats, where)
             else:
                 times_of = take_turns(cases.of(table), repeats, where)
+        of_scene = {"gaussians": count, "height": height, "width": width, "pairs_millions": cases.pairs}
         for name, times in times_of.items():
             case, _, backend = name.partition(", by ")
-            row: Row = {
-                "table": table,
-                "case": case,
-                "backend": backend or "auto",
-                "gaussians": count,
-                "height": height,
-                "width": width,
-                "pairs_millions": cases.pairs,
-                "repeats": repeats,
-            }
+            row: Row = {"table": table, "case": case, "backend": backend or "auto", **of_scene, "repeats": repeats}
             row |= {f"{key}_s": value for key, value in times._asdict().items()}
             row["wall_in_exp_per_pair"] = times.wall / (cases.pairs * 1e6) / unit
             rows.append(row)
@@ -89,10 +81,17 @@ def speed(*, out: Path, quick: bool = False, device: str = "cpu") -> None:
     memory = {backend: {count: _memory_of_its_own(count, backend) for count in counts} for backend in alone}
     points = _scaling([row for row in rows if row["table"] == "scaling"], counts[0])
     exponents = {name: _exponent(of) for name, of in points.items()}
-    more = {"peak_memory_mb": memory, "exp_s": unit, "exponents": exponents, "device": device}
     panels = {f"by {name}": {"forward + backward": (of, "o-")} for name, of in points.items()}
     write_plot(out / "scaling.png", panels, ylabel="wall time [s]")
-    write_results(out / "speed", rows, _markdown(rows, memory, unit, exponents), **more)
+    write_results(
+        out / "speed",
+        rows,
+        _markdown(rows, memory, unit, exponents),
+        peak_memory_mb=memory,
+        exp_s=unit,
+        exponents=exponents,
+        device=device,
+    )
 
 
 def backends(device: torch.device) -> list[str]:
@@ -244,19 +243,19 @@ def _exponent(points: np.ndarray) -> float:
 def _markdown(rows: list[Row], memory: dict[str, dict[int, float]], unit: float, exponents: dict[str, float]) -> str:
     tables: dict[str, dict[str, list[Row]]] = {}
     for row in rows:
-        name = row["case"] if row["backend"] == "auto" else f"{row['case']}, {row['backend']}"
+        name = f"{row['case']}, {row['backend']}".removesuffix(", auto")
         tables.setdefault(row["table"], {}).setdefault(name, []).append(row)
     quiet = tables["main"]
     counts = [f"{row['gaussians'] // 1000}k" for row in next(iter(quiet.values()))]
     main = []
     for name, by_count in quiet.items():
-        main.append([name, *map(_cell, by_count)])
+        spread = ([1e3 * row[f"{of}_s"] for of in ("wall", "best", "worst")] for row in by_count)
+        main.append([name, *("{:.0f} ({:.0f} to {:.0f}) ms".format(*numbers) for numbers in spread)])
         case, _, backend = name.rpartition(", ")
         if backend == "numba":
             main.append([f"{case}, times faster", *_ratios(quiet[f"{case}, torch"], by_count, case)])
     for name, by_count in tables["busy"].items():
-        cells = _ratios(by_count, quiet[name], "busy")
-        main.append([f"{name}, wall beside two busy processes over that", *cells])
+        main.append([f"{name}, wall beside two busy processes over that", *_ratios(by_count, quiet[name], "busy")])
     for backend, peaks in memory.items():
         target = "peak memory" if backend == "numba" else ""  # torch has no target
         cells = [_with_target(mb, target, count, ".0f") for count, mb in peaks.items()]
@@ -272,10 +271,6 @@ def _markdown(rows: list[Row], memory: dict[str, dict[int, float]], unit: float,
         + markdown_table(f"Left out, {savings[0]['gaussians']} Gaussians", ["ms", "of everything"], left_out)
         + f"Time grows as {grows} (pixels: at one count). Calibration: exp {unit * 1e9:.2f} ns per element.\n"
     )
-
-
-def _cell(row: Row) -> str:
-    return "{:.0f} ({:.0f} to {:.0f}) ms".format(*(1e3 * row[f"{name}_s"] for name in ("wall", "best", "worst")))
 
 
 def _ratios(over: list[Row], under: list[Row], name: str) -> list[str]:

@@ -47,10 +47,8 @@ def time_parts(run: Callable[[], Iterator[str]], repeats: int = 5, device: torch
                 walls.setdefault(name, []).append(time.perf_counter() - wall)
                 cpus.setdefault(name, []).append(time.process_time() - cpu)
             wall, cpu = time.perf_counter(), time.process_time()
-    return {
-        name: Times(statistics.median(of), min(of), max(of), statistics.median(cpus[name]))
-        for name, of in walls.items()
-    }
+    median = statistics.median
+    return {name: Times(median(of), min(of), max(of), median(cpus[name])) for name, of in walls.items()}
 
 
 @contextmanager

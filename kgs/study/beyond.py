@@ -40,7 +40,6 @@ OUT = (1, 2, 3)  # distances from the middle of the training cameras, over their
 SIZE = (189, 252)  # pixels of the room's views, height and width
 CAMERAS = 6  # at each of these distances
 OUTER = 0.25  # share of a real scene's photos that are held out
-_FITS = {True: {"steps": 500, "sh_degree": 0}, False: {"steps": 1000, "sh_degree": 0}}  # of the room and of real scenes
 
 
 class Target(NamedTuple):
@@ -55,24 +54,15 @@ def beyond_cells(data: Path | None) -> list[Cell]:
 
     DataError: `data` lacks a scene.
     """
-    scenes: list[tuple[str, int]] = [(ROOM, ROOM_VIEWS)]
     if data is not None:
         check_scenes(data, PHOTOS)
-        scenes += PHOTOS.items()
-    cells = [_cell(scene, views, seed) for seed, (scene, views) in product(range(3), scenes)]
-    return sorted(cells, key=lambda cell: cell["scene"] != ROOM)  # stable: by seed within each part
-
-
-def _cell(scene: str, views: int, seed: int) -> Cell:
-    synthetic = scene == ROOM
-    return {
-        "scene": scene,
-        "views": views,
-        "downscale": None if synthetic else 2.0,
-        "method": AUTO,
-        "seed": seed,
-        "fit": {"preset": AUTO, **_FITS[synthetic]},
-    }
+    parts = [({ROOM: ROOM_VIEWS}, None, 500), ({} if data is None else PHOTOS, 2.0, 1000)]
+    return [
+        {"scene": scene, "views": views, "downscale": downscale, "method": AUTO, "seed": seed}
+        | {"fit": {"preset": AUTO, "steps": steps, "sh_degree": 0}}
+        for scenes, downscale, steps in parts
+        for seed, (scene, views) in product(range(3), scenes.items())
+    ]
 
 
 def beyond_cell(cell: Cell, data: str | None = None, lpips_weights: str | None = None) -> dict[str, Any]:
@@ -88,7 +78,7 @@ def beyond_cell(cell: Cell, data: str | None = None, lpips_weights: str | None =
         What every cell stores of a fit; "test" and "train": the means of `evaluate`; "beyond": by distance, as text,
         what `measure_target` returns; of real scenes, whose test views are the outer ones, it is empty.
     """
-    config = fit_config("dense", cell["seed"], cell["fit"])
+    config, _ = fit_config("dense", cell["seed"], cell["fit"])
     scene = _scene(cell["scene"], cell["views"], cell["downscale"], data)
     points = choose_points(scene, config)
     lpips = load_lpips(lpips_weights)
@@ -109,10 +99,9 @@ def room_targets(scene: Scene) -> dict[int, Target]:
     targets = {}
     for out in OUT:
         views = views_beyond(out, CAMERAS, (height, width))
-        shown = []
-        for i, depth in enumerate(synthetic_depths(views.cameras)[:, 0]):
-            shown.append(views_that_show(depth, views.camera(i), train_depths, train.cameras) > 0)
-        targets[out] = Target(views, shown)
+        depths = enumerate(synthetic_depths(views.cameras)[:, 0])
+        counts = [views_that_show(depth, views.camera(i), train_depths, train.cameras) for i, depth in depths]
+        targets[out] = Target(views, [count > 0 for count in counts])
     return targets
 
 
@@ -127,13 +116,11 @@ def measure_target(
         pixels are the truth's; means over the views with such pixels, None without any or without the network, "psnr"
         also if one is infinite.
     """
-    levels = list[float]()
-    distances = list[float]()
-    shares = list[float]()
+    shares, levels, distances = list[float](), list[float](), list[float]()
     for i, shown in enumerate(target.shown):
         truth = target.views.images[i]
-        image = target.views.as_photo(i, target.views.render(i, render)[0].cpu())
-        image = torch.where(shown, image, truth)
+        drawn = target.views.as_photo(i, target.views.render(i, render)[0].cpu())
+        image = torch.where(shown, drawn, truth)
         share = float(shown.float().mean())
         shares.append(share)
         if share == 0:

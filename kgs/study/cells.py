@@ -52,15 +52,12 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
         data: the folder of the scenes; DataError: the scene is not there or damaged.
         lpips_weights: a folder with the weights of VGG16 and LPIPS, or None to leave LPIPS out.
     """
-    preset = cell["fit"].get("preset", "paper")
-    scene, points, seconds = _start(
-        data, cell["scene"], cell["views"], cell["downscale"], cell["start"], cell["seed"], preset
-    )
+    begin = (cell[key] for key in ("scene", "views", "downscale", "start", "seed"))
+    scene, points, seconds = _start(data, *begin, cell["fit"].get("preset", "paper"))
     lpips = load_lpips(lpips_weights)
-    settings, rival = _split(cell["fit"])
-    config = fit_config(cell["start"], cell["seed"], settings)
+    config, rival = fit_config(cell["start"], cell["seed"], cell["fit"])
     trainer, fit, result = fit_and_measure(scene, config, points, lpips, rival)
-    if cell["scene"] == SYNTHETIC and cell["seed"] == 0:
+    if cell["scene"] == SYNTHETIC and cell["seed"] == 0:  # of other scenes no photo may be published
         result["pictures"] = _pictures(fit)
     result["test_views"] = {view["name"]: view["psnr"] for view in fit.metrics["test"]["views"]}
     result["init"] |= {"seconds": round(seconds, 2)}
@@ -111,7 +108,7 @@ def fit_and_measure(
 
 
 def _pictures(fit: Fit) -> list[str]:
-    """The first test view, its render and their difference, for the page; of other scenes none may be published."""
+    """The first test view, its render and their difference, for the page."""
     views = fit.scene.test
     render = fit.render(views.camera(0))[0]
     (picture,) = encoded([Picture(views.names[0], views.images[0], {"": render})], 2**20)
@@ -133,26 +130,19 @@ def _start(
         photo_folder, factor, _ = field_size(source)
         shrink = None if downscale is None and factor is None else (downscale or 1.0) * (factor or 1.0)
         scene = load_scene(source, views, shrink, points=points_of, photo_folder=photo_folder)
-    config = fit_config(start, seed, {"preset": preset})
+    config, _ = fit_config(start, seed, {"preset": preset})
     begin = time.process_time()
     with warnings.catch_warnings(action="ignore", category=UserWarning):  # `kind` records a fallback
         points = _full_model(scene, seed) if start == FULL else choose_points(scene, config)
     return scene, points, time.process_time() - begin
 
 
-def _split(fit: dict[str, Any]) -> tuple[dict[str, Any], Rival | None]:
-    """The settings of a cell for `FitConfig`, and those of a rival if it has any."""
-    names = {field.name for field in fields(Rival)}
-    settings = {name: value for name, value in fit.items() if name not in names}
-    of_rival = {name: value for name, value in fit.items() if name in names}
-    return settings, Rival(**of_rival) if of_rival else None
-
-
-def fit_config(start: str, seed: int, fit: dict[str, Any]) -> FitConfig:
-    """The configuration of a cell: a preset (paper unless `fit` names one), with a start, a seed and other settings."""
+def fit_config(start: str, seed: int, fit: dict[str, Any]) -> tuple[FitConfig, Rival | None]:
+    """A cell's preset (paper unless `fit` names one) with its start, seed and other settings, and its rival if any."""
     settings: dict[str, Any] = {"init": "model-points" if start == FULL else start, "seed": seed, **fit}
     preset = settings.pop("preset", "paper")
-    return replace(PRESETS[preset], **settings)
+    of_rival = {field.name: settings.pop(field.name) for field in fields(Rival) if field.name in settings}
+    return replace(PRESETS[preset], **settings), Rival(**of_rival) if of_rival else None
 
 
 def _full_model(scene: Scene, seed: int) -> InitialPoints:

@@ -4,7 +4,7 @@ import os
 import sys
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 
@@ -82,9 +82,10 @@ def study(
     check_installed("pandas", "scipy", "distributed", "matplotlib", "jinja2")
     load_tools()
 
-    from . import beyond, beyond_report, guard, paper_tables, presets
+    from . import beyond, beyond_report, guard, presets
     from .cells import sparse_cell
     from .grid import finished_rows, read_rows, run_grid
+    from .published import cells_of_table
     from .report import write_report
 
     data = Path(os.environ["KGS_DATA"]) if os.environ.get("KGS_DATA") else None
@@ -107,10 +108,13 @@ def study(
         same += f" --steps {steps}"
     if preset == "guard" and seeds is None:
         seeds = (0,)
-    chosen = cells if table is None or data is None else paper_tables.cells_of_table(cells, table, data)
+    chosen = cells if table is None or data is None else cells_of_table(cells, table, data)
     chosen = presets.select(chosen, scenes=scenes, methods=methods, views=views, seeds=seeds)
     if list_cells:
-        _list(chosen, finished_rows(chosen, path))
+        done = [row["cell"] for row in finished_rows(chosen, path)]
+        for cell in chosen:
+            print(f"{'done' if cell in done else 'to do':>5}: {presets.name_of(cell)}")
+        print(f"{len(done)} of {len(chosen)} are done")
         return 0
     if (report_only or read_rows(path)) and not finished_rows(cells, path):
         own = "give each preset and number of steps its own folder"
@@ -135,14 +139,3 @@ def study(
                 if preset == "guard":
                     print(text)
     return int(len(finished_rows(chosen, path)) < len(chosen))
-
-
-def _list(cells: list[dict[str, Any]], rows: list[dict[str, Any]]) -> None:
-    """Print a line for each cell."""
-    from .presets import name_of
-
-    done = [row["cell"] for row in rows]
-    for cell in cells:
-        state = "done" if cell in done else "to do"
-        print(f"{state:>5}: {name_of(cell)}")
-    print(f"{len(done)} of {len(cells)} are done")

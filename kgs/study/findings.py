@@ -35,14 +35,8 @@ def headline(frame: pd.DataFrame) -> list[dict[str, str]]:
         gain = difference(cells, key, value, base, measure)
         if not gain.pairs:
             continue
-        line = {
-            "": what,
-            "measure": label,
-            _MEAN: gain.text(decimals, labels=True),
-            "scenes": str(gain.scenes),
-            "pairs": str(gain.pairs),
-            "sd of a pair": mean_sd([gain.sd], decimals),
-        }
+        line = {"": what, "measure": label, _MEAN: gain.text(decimals, labels=True)}
+        line |= {"scenes": str(gain.scenes), "pairs": str(gain.pairs), "sd of a pair": mean_sd([gain.sd], decimals)}
         for (scene,), cells_of_scene in grouped(cells, "scene"):
             line[scene] = difference(cells_of_scene, key, value, base, measure).text(decimals)
         lines.append(line)
@@ -66,10 +60,9 @@ def findings(frame: pd.DataFrame) -> list[str]:
         sentences.append(f"The default over the best other method of each scene: {mean}, at worst {smallest}; {how}.")
     noise = noise_floor(wide(frame, PSNR))
     if noise.freedom:
-        single = f"two single runs differ by up to {noise.between_means(1):.2f} dB"
-        three = f"two means of three by up to {noise.between_means(3):.2f} dB"
-        groups = f"{noise.groups} groups of runs"
-        sentences.append(f"Where nothing but the seed differs, {single}, and {three}, 95 times in 100 ({groups}).")
+        single, three = (f"by up to {noise.between_means(n):.2f} dB" for n in (1, 3))
+        runs = f"two single runs differ {single}, and two means of three {three}, 95 times in 100"
+        sentences.append(f"Where nothing but the seed differs, {runs} ({noise.groups} groups of runs).")
     return sentences
 
 

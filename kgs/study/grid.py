@@ -9,7 +9,6 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -67,24 +66,14 @@ def run_grid(
     missing = [cell for cell in cells if _key(cell) not in done]
     say(f"{len(cells) - len(missing)} of {len(cells)} cells are there, {len(missing)} to do")
     if missing:
-        with _client(processes, scheduler) as client, Running.of(client) as running:
-            _do(client, work, missing, path, partial(_say_aside, running, say), name, running)
+        running = Running(say)
+        with _client(processes, scheduler) as client, running.listening(client):
+            _do(client, work, missing, path, name, running)
     return finished_rows(cells, path)
 
 
-def _say_aside(running: Running, say: Callable[[str], None], line: str) -> None:
-    with running.aside():
-        say(line)
-
-
 def _do(
-    client: Client,
-    work: Work,
-    cells: Sequence[Cell],
-    path: Path,
-    say: Callable[[str], None],
-    name: Callable[[Cell], str],
-    running: Running,
+    client: Client, work: Work, cells: Sequence[Cell], path: Path, name: Callable[[Cell], str], running: Running
 ) -> None:
     """Do the cells on the client's workers and append each to the file when it is done."""
     cell_of: dict[Any, Cell] = {}  # of the futures that are not done
@@ -94,7 +83,7 @@ def _do(
     finished = 0
     failed = 0
     futures = as_completed()
-    _wait(client, say)
+    _wait(client, running)
     begin = time.perf_counter()
 
     def submit() -> None:
@@ -103,7 +92,7 @@ def _do(
             alone = True
             waiting.append(suspects.popleft())
         if not cell_of and waiting:
-            _wait(client, say)  # the last one died
+            _wait(client, running)  # the last one died
         free = _threads(client) - len(cell_of)  # a queued cell would be lost with its worker
         for _ in range(min(free, len(waiting))):
             cell = waiting.popleft()
@@ -123,23 +112,26 @@ def _do(
             suspects.append(cell)
         elif error:
             failed += 1
-            say(f"failed: {name(cell)}: {type(error).__name__}: {error}")
+            running.say(f"failed: {name(cell)}: {type(error).__name__}: {error}")
         else:
             finished += 1
-            _append(path, {"cell": cell, "result": future.result()})
-            say(f"{finished + failed} of {len(cells)}: {name(cell)}")
+            with path.open("ab") as file:
+                file.write(_key({"cell": cell, "result": future.result()}).encode() + b"\n")
+                file.flush()
+                os.fsync(file.fileno())
+            running.say(f"{finished + failed} of {len(cells)}: {name(cell)}")
         future.release()  # else Dask does the cell again if this worker dies later
         submit()
     seconds = time.perf_counter() - begin
-    say(f"{finished} cells in {seconds:.0f} s, {60 * finished / seconds:.2f} a minute")
+    running.say(f"{finished} cells in {seconds:.0f} s, {60 * finished / seconds:.2f} a minute")
     if failed:
-        say(f"{failed} of {len(cells)} cells failed; run again to try them once more")
+        running.say(f"{failed} of {len(cells)} cells failed; run again to try them once more")
 
 
-def _wait(client: Client, say: Callable[[str], None]) -> None:
+def _wait(client: Client, running: Running) -> None:
     """Wait until there is a worker."""
     if not _threads(client):
-        say("waiting for a worker")
+        running.say("waiting for a worker")
         client.wait_for_workers(1)
 
 
@@ -149,13 +141,6 @@ def _threads(client: Client) -> int:
         return sum(client.nthreads().values())
     except OSError:
         raise ArgumentError(*_LOST, advice="run again to go on") from None
-
-
-def _append(path: Path, row: dict[str, Any]) -> None:
-    with path.open("ab") as file:
-        file.write(_key(row).encode() + b"\n")
-        file.flush()
-        os.fsync(file.fileno())
 
 
 @contextmanager
@@ -208,7 +193,7 @@ def read_rows(path: Path, *, repair: bool = False) -> list[dict[str, Any]]:
 
     Args:
         path: the file.
-        repair: also remove a last line that was cut short from the file.
+        repair: also remove such a line from the file.
 
     Raises:
         DataError: another line is not JSON, or a line is not that of a cell.

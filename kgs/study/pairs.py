@@ -89,16 +89,9 @@ def paired_difference(differences: pd.DataFrame) -> Difference:
     noise = noise_floor(differences)
     by_seeds = _half_interval(noise.freedom, noise.sd * math.sqrt((1 / counts).sum()) / max(1, k))
     by_scenes = _half_interval(k - 1, error)
-    return Difference(
-        pairs=int(counts.sum()),
-        mean=mean,
-        low=mean - by_seeds,
-        high=mean + by_seeds,
-        sd=noise.sd,
-        scenes=k,
-        over_scenes=(mean - by_scenes, mean + by_scenes),
-        error=error,
-    )
+    over_scenes = (mean - by_scenes, mean + by_scenes)
+    pairs = int(counts.sum())
+    return Difference(pairs, mean, mean - by_seeds, mean + by_seeds, noise.sd, k, over_scenes, error)
 
 
 def _half_interval(freedom: int, error: float) -> float:
@@ -128,6 +121,11 @@ def cells_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
         return column if column.name == "views" else column.map(order).fillna(len(order))
 
     return frame.sort_values([*KEYS], key=rank)
+
+
+def with_measures(cells: pd.DataFrame) -> pd.DataFrame:
+    """With "gap", the PSNR of training less that of test views in dB, and "thousandths" of co-adaptation."""
+    return cells.assign(gap=cells["train.psnr"] - cells[PSNR], thousandths=1e3 * cells.coadaptation)
 
 
 def grouped(frame: pd.DataFrame, *keys: str) -> Iterable[tuple[Any, pd.DataFrame]]:

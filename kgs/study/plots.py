@@ -1,6 +1,6 @@
 """The plots of the study and of the training sweep: one function draws them all, one colour and marker per method."""
 
-from functools import partial
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ from matplotlib.ticker import LogLocator
 
 from kgs.app.files.figures import DEFAULT, WITHOUT
 
-from .pairs import KEYS, STARTS, difference, grouped, main_cells
+from .pairs import KEYS, PSNR, STARTS, difference, grouped, main_cells, with_measures
 from .presets import AUTO, FAMILIES, FIXED, MAIN, OFF, PAPER
 
 # Colours of Okabe and Ito, told apart by colour-blind people too; those that share one differ in the marker.
@@ -71,7 +71,7 @@ def write_plots(frame: pd.DataFrame, out: Path) -> dict[str, str]:
         if len(points):
             scale = "log" if name == "thresholds" else "linear"
             panels(points, xlabel=xlabel, ylabel=ylabel, xscale=scale).savefig(out / f"{name}.png")
-            captions[f"{name}.png"] = caption
+            captions[f"{name}.png"] = caption.format(xlabel)
     return captions
 
 
@@ -91,14 +91,14 @@ def _forest(frame: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(lines).assign(panel="", y=range(len(lines)))
 
 
-def _scattered(frame: pd.DataFrame, x: str) -> pd.DataFrame:
-    cells = main_cells(frame, STARTS)
-    measures = {
-        "gap": cells["train.psnr"] - cells["test.psnr"],
-        "coadaptation": 1e3 * cells.coadaptation,
-        "cost": cells.cpu_seconds,
-    }
-    return _in_panels(cells.assign(x=measures[x], y=cells["test.psnr"]).dropna(subset=["x", "y"]))
+def _scattered(measure: str) -> Callable[[pd.DataFrame], pd.DataFrame]:
+    """The points of test PSNR over a measure."""
+
+    def points(frame: pd.DataFrame) -> pd.DataFrame:
+        cells = with_measures(main_cells(frame, STARTS))
+        return _in_panels(cells.assign(x=cells[measure], y=cells[PSNR]).dropna(subset=["x", "y"]))
+
+    return points
 
 
 def _curves(frame: pd.DataFrame) -> pd.DataFrame:
@@ -143,20 +143,16 @@ _SEEDS = "mean over seeds, bars of one sd"
 _SHARES = f"""Gaussians whose mean gradient is over the densification threshold, by distance from the nearest camera, \
 {OFF} and {PAPER}: {_SEEDS}; each point stands for a sixth of the initial points; a fit at its limit of Gaussians \
 keeps those that it could not densify"""
-# What each plot shows, its axes, and its caption.
-_PSNR = "test PSNR [dB]"
 _FOREST = """Paired differences of test PSNR over off, with 95 % intervals, of one scene over seeds; n pairs; from the \
 same initial points, but for the default's"""
-_PLOTS = {
+_CURVES = f"Test PSNR during the fit, {', '.join((*MAIN, AUTO))}: {_SEEDS}"
+_CELLS = "Test PSNR against {}; one point per cell, filled by its start"
+_PSNR = "test PSNR [dB]"
+_PLOTS = {  # what each shows, its axes, and its caption, where {} is the first axis
     "forest": (_forest, "test PSNR over off, same seeds and views [dB]", "", _FOREST),
-    "curves": (_curves, "step", _PSNR, f"Test PSNR during the fit, {', '.join((*MAIN, AUTO))}: {_SEEDS}"),
+    "curves": (_curves, "step", _PSNR, _CURVES),
+    "gap": (_scattered("gap"), "overfitting: PSNR, training less test views [dB]", _PSNR, _CELLS),
+    "cost": (_scattered("cpu_seconds"), "CPU time of the fit [s]", _PSNR, _CELLS),
+    "coadaptation": (_scattered("thousandths"), "co-adaptation [1e-3]", _PSNR, _CELLS),
+    "thresholds": (_thresholds, "distance [median of the initial points]", "over the threshold [%]", _SHARES),
 }
-_SCATTERED = {
-    "gap": "overfitting: PSNR, training less test views [dB]",
-    "cost": "CPU time of the fit [s]",
-    "coadaptation": "co-adaptation [1e-3]",
-}
-for _name, _x in _SCATTERED.items():
-    _caption = f"Test PSNR against {_x}; one point per cell, filled by its start"
-    _PLOTS[_name] = (partial(_scattered, x=_name), _x, _PSNR, _caption)
-_PLOTS["thresholds"] = (_thresholds, "distance [median of the initial points]", "over the threshold [%]", _SHARES)

@@ -20,6 +20,8 @@ FIXED = "fixed 0.1"
 MAIN = (OFF, PAPER, FIXED)
 AUTO = "auto"  # kgs fit as it comes
 AUTO_OFF = "auto, off"  # the same without dropping
+AUTOS = (AUTO, AUTO_OFF)
+SEEDS = range(3)
 # The settings of each method's fit that are not those of the preset paper. Tables and plots keep this order.
 METHODS: dict[str, dict[str, Any]] = {
     OFF: {"drop": 0.0},
@@ -65,12 +67,7 @@ def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
     """The cells of a preset, the most telling ones first, those of one start together.
 
     Args:
-        preset: "quick": the synthetic scene, minutes. "cpu": the six scenes of `SCENES` in a quarter of the pixels of
-            504x378, 2000 steps, and the synthetic one to be shown; hours. "field": the six scenes in full size, 2000
-            steps, the default with its own number, more views, and what is there of `JOINED`; hours. "field-long": the
-            first three of them with 10 000 steps; hours. "paper": 10 000 steps in full size on every scene below
-            `data`; days on a CPU. "guard": the eight scenes of `GUARD` in half size, the default with its own number of
-            steps and the paper's rule with 700, seed 0, then the default with seeds 1 and 2; minutes.
+        preset: "quick", "cpu", "field", "field-long", "paper" or "guard", as the help of `kgs study` says of them.
         data: the folder of the scenes: `llff/fern` and so on; DataError: None, or a scene is missing.
     """
     if preset not in _FITS:
@@ -78,9 +75,9 @@ def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
     if preset == "quick":
         scene = [(SYNTHETIC, 3)]
         blocks: list[Block] = [
-            (range(3), scene, ["dense"], MAIN),
+            (SEEDS, scene, ["dense"], MAIN),
             ([0], scene, ["dense"], ("fixed 0.2", "far", "L1 distance 0.01")),
-            ([0], scene, ["dense"], (AUTO, AUTO_OFF)),
+            ([0], scene, ["dense"], AUTOS),
             ([0], scene, ["sift", "random"], [PAPER]),
         ]
     elif data is None:
@@ -90,7 +87,7 @@ def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
         blocks = blocks_of[preset](data)
     fits = {method: _FITS[preset] | settings for method, settings in METHODS.items()}
     if preset in ("field", "guard"):
-        for method in (AUTO, AUTO_OFF):
+        for method in AUTOS:
             fits[method]["steps"] = None  # their own number
     return [
         {"scene": scene, "views": views, "start": start, "method": method, "seed": seed}
@@ -145,65 +142,70 @@ def select(
 def _cpu(data: Path) -> list[Block]:
     """The six scenes in a quarter of the pixels."""
     check_scenes(data, SCENES)
-    seeds = range(3)
     fern = [("llff/fern", 3)]
-    flower = [("llff/flower", 3)]
-    lego = [("blender/lego", 8)]
-    auto = (AUTO, AUTO_OFF)
-    rivals = [name for name in METHODS if name not in (*MAIN, *auto)]
+    rivals = [name for name in METHODS if name not in (*MAIN, *AUTOS)]
     bounds = ("random", "model-points", FULL)  # no fit may have the last two
-    blocks: list[Block] = []
-    for seed in seeds:
-        for methods in (MAIN, auto):
-            blocks += [([seed], [scene], ["dense"], methods) for scene in SCENES.items()]
-    for seed in seeds:
-        blocks += [([seed], MORE_VIEWS, ["dense"], methods) for methods in ((OFF, PAPER), auto)]
-    blocks += [([seed], SCENES.items(), ["sift"], [PAPER]) for seed in seeds]
-    blocks.append((seeds, lego, ["scene"], MAIN))
-    blocks.append((seeds, fern, ["dense"], rivals))
-    blocks += [(seeds, fern, [start], [PAPER]) for start in bounds]
-    blocks += [([0], [(SYNTHETIC, 3)], ["dense"], methods) for methods in (MAIN, auto)]  # pictures for the page
-    blocks.append(([0], flower, bounds, [PAPER]))
-    return blocks
+    return [
+        *_by_seed((scene, methods) for methods in (MAIN, AUTOS) for scene in SCENES.items()),
+        *[([seed], MORE_VIEWS, ["dense"], methods) for seed in SEEDS for methods in ((OFF, PAPER), AUTOS)],
+        *[([seed], SCENES.items(), ["sift"], [PAPER]) for seed in SEEDS],
+        (SEEDS, [("blender/lego", 8)], ["scene"], MAIN),
+        (SEEDS, fern, ["dense"], rivals),
+        *[(SEEDS, fern, [start], [PAPER]) for start in bounds],
+        *[([0], [(SYNTHETIC, 3)], ["dense"], methods) for methods in (MAIN, AUTOS)],  # pictures for the page
+        ([0], [("llff/flower", 3)], bounds, [PAPER]),
+    ]
 
 
 def _field(data: Path) -> list[Block]:
     """The field's protocol: photos in the size that they have, every eighth held out. LLFF's are 504x378."""
     check_scenes(data, SCENES)
-    seeds = range(3)
-    auto = (AUTO, AUTO_OFF)
-    blocks: list[Block] = []
-    for scenes in (FORWARD, OBJECTS):
-        for seed in seeds:
-            blocks += [([seed], [scene], ["dense"], MAIN) for scene in scenes.items()]
-    for seed in seeds:
-        blocks += [([seed], [scene], ["dense"], auto) for scene in SCENES.items()]
-    for seed in seeds:
-        for setting in (*product(FORWARD, (6, 9)), *_joined(data)):
-            blocks += [([seed], [setting], ["dense"], methods) for methods in ((OFF, PAPER), auto)]
-    return blocks
+    more_views = [*product(FORWARD, (6, 9)), *_joined(data)]
+    return [
+        *_by_seed((scene, MAIN) for scene in FORWARD.items()),
+        *_by_seed((scene, MAIN) for scene in OBJECTS.items()),
+        *_by_seed((scene, AUTOS) for scene in SCENES.items()),
+        *_by_seed(product(more_views, ((OFF, PAPER), AUTOS))),
+    ]
 
 
 def _joined(data: Path) -> list[tuple[str, int]]:
-    return [
-        (scene, views)
-        for scene, counts in JOINED.items()
-        for views in counts
-        if (data / scene).is_dir() and views <= _training_photos(data / scene)
-    ]
+    there = {scene: counts for scene, counts in JOINED.items() if (data / scene).is_dir()}
+    settings = [(scene, views) for scene, counts in there.items() for views in counts]
+    return [(scene, views) for scene, views in settings if views <= _training_photos(data / scene)]
 
 
 def _field_long(data: Path) -> list[Block]:
     check_scenes(data, FORWARD)
-    return [([seed], [scene], ["dense"], (OFF, PAPER, AUTO)) for seed in range(3) for scene in FORWARD.items()]
+    return _by_seed((scene, (OFF, PAPER, AUTO)) for scene in FORWARD.items())
 
 
 def _guard(data: Path) -> list[Block]:
     """Three methods with one seed; last the default's other seeds, which tell the noise of each scene."""
     check_scenes(data, GUARD)
-    blocks: list[Block] = [([0], [scene], ["dense"], (AUTO, AUTO_OFF, PAPER)) for scene in GUARD.items()]
-    blocks.append(((1, 2), GUARD.items(), ["dense"], [AUTO]))
+    blocks: list[Block] = [([0], [scene], ["dense"], (*AUTOS, PAPER)) for scene in GUARD.items()]
+    return [*blocks, ((1, 2), GUARD.items(), ["dense"], [AUTO])]
+
+
+def _paper(data: Path) -> list[Block]:
+    """All scenes with all numbers of views that they have photos for; `too_few_photos` names the others."""
+    folders = _scenes_of_paper(data)
+    if not folders:
+        raise DataError(data, "", f"scenes in folders named {sorted(VIEWS)}", "none")
+    blocks: list[Block] = []
+    for seed, path in product(range(5), folders):
+        layout = path.parent.name
+        starts = ["dense", "scene"] if layout == "blender" else ["dense"]  # Blender's random points, as published
+        for views in VIEWS[layout]:
+            if views <= _training_photos(path):
+                methods = METHODS if layout == "llff" and views == 3 else MAIN
+                blocks.append(([seed], [(str(path.relative_to(data)), views)], starts, methods))
     return blocks
+
+
+def _by_seed(settings: Iterable[tuple[tuple[str, int], Iterable[str]]]) -> list[Block]:
+    """Scenes with methods from dense points, all of a seed before the next."""
+    return [([seed], [scene], ["dense"], methods) for seed, (scene, methods) in product(SEEDS, settings)]
 
 
 def too_few_photos(preset: str, data: Path) -> list[str]:
@@ -213,12 +215,12 @@ def too_few_photos(preset: str, data: Path) -> list[str]:
         wanted = {path: VIEWS[path.parent.name] for path in _scenes_of_paper(data)}
     elif preset == "field":
         wanted = {data / scene: counts for scene, counts in JOINED.items() if (data / scene).is_dir()}
-    sentences = []
-    for path, counts in wanted.items():
-        there = _training_photos(path)
-        name = path.relative_to(data)
-        sentences += [f"{name} with {n} views: it has {there} photos to train on" for n in counts if n > there]
-    return sentences
+    return [
+        f"{path.relative_to(data)} with {n} views: it has {_training_photos(path)} photos to train on"
+        for path, counts in wanted.items()
+        for n in counts
+        if n > _training_photos(path)
+    ]
 
 
 def _scenes_of_paper(data: Path) -> list[Path]:
@@ -232,21 +234,3 @@ def _training_photos(path: Path) -> int:
         return len(load_scene(path, photos=False).train)
     except DataError:
         return max(map(max, VIEWS.values()))
-
-
-def _paper(data: Path) -> list[Block]:
-    folders = _scenes_of_paper(data)
-    if not folders:
-        raise DataError(data, "", f"scenes in folders named {sorted(VIEWS)}", "none")
-    blocks: list[Block] = []
-    for seed in range(5):
-        for path in folders:
-            layout = path.parent.name
-            # Blender scenes also from the layout's random points, as published.
-            starts = ["dense", "scene"] if layout == "blender" else ["dense"]
-            for views in VIEWS[layout]:
-                if views > _training_photos(path):
-                    continue  # `too_few_photos` names it
-                methods = METHODS if layout == "llff" and views == 3 else MAIN
-                blocks.append(([seed], [(str(path.relative_to(data)), views)], starts, methods))
-    return blocks

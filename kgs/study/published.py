@@ -3,9 +3,14 @@
 H. Park, G. Ryu, W. Kim, "DropGaussian: Structural Regularization for Sparse-view Gaussian Splatting", CVPR 2025.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
+
+from kgs._support.errors import ArgumentError, DataError
+
+from .grid import Cell
 
 # Columns benchmark, views, table (the main comparison first), method, psnr, ssim, lpips.
 PUBLISHED = pd.read_csv(Path(__file__).with_name("published.csv"))
@@ -14,7 +19,16 @@ SCENES_OF = {
     "Mip-NeRF 360": ("bicycle", "bonsai", "counter", "garden", "kitchen", "room", "stump"),
     "Blender": ("chair", "drums", "ficus", "hotdog", "lego", "materials", "mic", "ship"),
 }
-
+# The benchmark and the name in published.csv of table 1, 2, ..., as docs/sparse-views.md counts them.
+TABLES = (
+    ("LLFF", "comparison"),
+    ("Mip-NeRF 360", "comparison"),
+    ("Blender", "comparison"),
+    ("LLFF", "rate and schedule"),
+    ("LLFF", "selection"),
+    ("LLFF", "L1"),
+)
+LAYOUTS = {"LLFF": "llff", "Mip-NeRF 360": "colmap", "Blender": "blender"}  # the folder of a benchmark's scenes
 # PSNR of a public training log of a method that starts from a pretrained matcher and uses monocular depths: 504x378,
 # three views, means of three seeds; of trex another undistortion of the same photos.
 PRIORS = {"llff/fern": 23.84, "llff/flower": 21.41, "colmap/trex": 23.51}
@@ -48,3 +62,31 @@ def published_difference(benchmark: str | None, views: int, method: str, base: s
         return "-"
     gains = [f"{psnr - of_base.get(table, of_base.iloc[0]):+.2f}" for table, psnr in of_method.items()]
     return " or ".join(dict.fromkeys(gains)) or "-"
+
+
+def cells_of_table(cells: Sequence[Cell], table: int, data: Path) -> list[Cell]:
+    """The cells whose figures the paper prints in one of its tables, in their order.
+
+    Args:
+        cells: those of the preset "paper".
+        table: number of the table, from 1.
+        data: the folder of the scenes.
+
+    Raises:
+        ValueError: there is no such table.
+        DataError: no cell is of the table, since `data` has none of its scenes, or they have too few photos.
+    """
+    if not 1 <= table <= len(TABLES):
+        raise ArgumentError("table", f"a number from 1 to {len(TABLES)}", table)
+    benchmark, name = TABLES[table - 1]
+    printed = PUBLISHED[(PUBLISHED.benchmark == benchmark) & (PUBLISHED.table == name)]
+    settings = {*zip(printed.views, printed.method, strict=True)}
+    layout = LAYOUTS[benchmark]
+    chosen = [cell for cell in cells if (cell["views"], cell["method"]) in settings]
+    chosen = [cell for cell in chosen if cell["scene"].startswith(f"{layout}/")]
+    chosen = [cell for cell in chosen if benchmark_of(cell["scene"], cell["views"]) == benchmark]
+    if not chosen:
+        scenes = ", ".join(SCENES_OF[benchmark])
+        expected = f"a scene of {benchmark} ({scenes}) with photos enough for table {table}"
+        raise DataError(data / layout, "", expected, "none")
+    return chosen

@@ -53,9 +53,13 @@ class _Cell:
 
 
 class Running:
-    """Shows the running cells on stderr: a bar for each on a terminal, else a line for each quarter of their steps."""
+    """Shows the running cells on stderr: a bar for each on a terminal, else a line for each quarter of their steps.
 
-    def __init__(self) -> None:
+    `print_line` takes a line of text for the user.
+    """
+
+    def __init__(self, print_line: Callable[[str], None] = print) -> None:
+        self._print_line = print_line
         self._cells: dict[Any, _Cell] = {}
         self._lock = Lock()  # messages come in a thread of the client
         self._bar: Any = None  # tqdm's class, where bars are shown
@@ -97,20 +101,17 @@ class Running:
                 say(f"{cell.name}: {told['step']} of {told['steps']} steps", sys.stderr)
             cell.quarter = quarter
 
-    @contextmanager
-    def aside(self) -> Iterator[None]:
-        """The bars make room for a line."""
+    def say(self, line: str) -> None:
+        """Print a line, for which the bars make room."""
         with self._lock, nullcontext() if self._bar is None else self._bar.external_write_mode():
-            yield
+            self._print_line(line)
 
-    @classmethod
     @contextmanager
-    def of(cls, client: Client) -> Iterator["Running"]:
+    def listening(self, client: Client) -> Iterator[None]:
         """While the client's workers do cells; what is left on the terminal is removed in the end."""
-        running = cls()
-        client.subscribe_topic(TOPIC, running.hear)
+        client.subscribe_topic(TOPIC, self.hear)
         try:
-            yield running
+            yield
         finally:
-            for key in list(running._cells):
-                running.end(key)
+            for key in list(self._cells):
+                self.end(key)

@@ -7,7 +7,7 @@ import pandas as pd
 from kgs.bench.output import mean_sd
 
 from .findings import headline, regret
-from .pairs import KEYS, LPIPS, PSNR, difference, grouped, main_cells, noise_floor, wide
+from .pairs import KEYS, LPIPS, PSNR, difference, grouped, main_cells, noise_floor, wide, with_measures
 from .presets import AUTO, AUTO_OFF, FAMILIES, MAIN, OFF, PAPER
 from .published import benchmark_of, priors, published, published_difference
 from .texts import table_of
@@ -50,10 +50,12 @@ def sparse_tables(frame: pd.DataFrame) -> dict[str, pd.DataFrame]:
     for title in families:
         scenes = main[main.method.isin({*FAMILIES[title]} - {*HEAD})].scene
         tables[title] = _settings(main[main.scene.isin(scenes)], (OFF, PAPER, *FAMILIES[title]), (OFF, PAPER))
-    tables["The degree of harmonics that was chosen, by seed"] = _degrees(frame)
-    tables[_NOISE] = _noise(frame)
-    tables["Cost, overfitting and co-adaptation: mean (sd) over n seeds"] = _costs(main)
-    tables["Scenes, splits and settings"] = _protocol(frame)
+    tables |= {
+        "The degree of harmonics that was chosen, by seed": _degrees(frame),
+        _NOISE: _noise(frame),
+        "Cost, overfitting and co-adaptation: mean (sd) over n seeds": _costs(main),
+        "Scenes, splits and settings": _protocol(frame),
+    }
     return {title: table_of(lines) for title, lines in tables.items() if lines}
 
 
@@ -67,10 +69,8 @@ def _by_views(dense: pd.DataFrame) -> Lines:
 
 
 def _costs(main: pd.DataFrame) -> Lines:
-    """What fits cost, and how much they overfit."""
-    main = main.assign(gap=main["train.psnr"] - main[PSNR], thousandths=1e3 * main.coadaptation)
     lines = []
-    for (*_, method), cells in grouped(main, *KEYS):
+    for (*_, method), cells in grouped(with_measures(main), *KEYS):
         line = {"scene": _setting(cells), "method": method, "n": str(len(cells))}
         lines.append(line | {head: mean_sd(cells[key], decimals) for head, (key, decimals) in _COST.items()})
     return lines
@@ -80,17 +80,13 @@ def _protocol(frame: pd.DataFrame) -> Lines:
     """Each scene's split, size and common settings."""
     lines = []
     for (scene, views), cells in grouped(frame.sort_values([*KEYS[:2]]), *KEYS[:2]):
-        first = cells.iloc[0]
-        height, width = first["protocol.image_size"]
+        protocol = cells.iloc[0].filter(like="protocol.").rename(lambda name: name.removeprefix("protocol."))
+        height, width = protocol.image_size
+        line = {"scene": f"{scene}, {views} views"}
+        line |= {"training views": str(len(protocol.train)), "test views": str(len(protocol.test))}
+        line |= {"cells": str(len(cells)), "size": f"{width}x{height}"}
         shared = sorted(set.intersection(*({*fit.items()} for fit in cells.fit)))
-        line = {
-            "scene": f"{scene}, {views} views",
-            "training views": str(len(first["protocol.train"])),
-            "test views": str(len(first["protocol.test"])),
-            "cells": str(len(cells)),
-            "size": f"{width}x{height}",
-            "what all fits share": ", ".join(f"{key} {value}" for key, value in shared) or "-",
-        }
+        line["what all fits share"] = ", ".join(f"{key} {value}" for key, value in shared) or "-"
         lines.append(line)
     return lines
 
@@ -118,7 +114,8 @@ def _compared(cells: pd.DataFrame, methods: Iterable[str], mean: str = "", bases
     scenes = cells.scene.unique()
     if mean and len(scenes) < 2:
         return []
-    benchmark, views = _benchmark(cells)
+    benchmarks = {(benchmark_of(scene, views), views) for (scene, views), _ in grouped(cells, *KEYS[:2])}
+    benchmark, views = benchmarks.pop() if len(benchmarks) == 1 else (None, 0)  # that all these cells are from
     if mean:
         name = mean.format(len(scenes), ", ".join(scene.rpartition("/")[2] for scene in scenes))
         with_priors = "-"
@@ -187,13 +184,9 @@ def _noise(frame: pd.DataFrame) -> Lines:
             continue
         line = {"scene": name, "measure": QUALITY[measure]}
         line |= {"groups": str(noise.groups), "degrees of freedom": str(noise.freedom)}
-        numbers = {
-            "sd between seeds": noise.sd,
-            "two single runs": noise.between_means(1),
-            "two means of 3": noise.between_means(3),
-            "two means of 5": noise.between_means(5),
-            "best of 5 over the mean": BEST_OF_5 * noise.sd,
-        }
+        numbers = {"sd between seeds": noise.sd, "two single runs": noise.between_means(1)}
+        numbers |= {f"two means of {n}": noise.between_means(n) for n in (3, 5)}
+        numbers["best of 5 over the mean"] = BEST_OF_5 * noise.sd
         decimals = 3 if measure == PSNR else 4
         lines.append(line | {head: f"{number:.{decimals}f}" for head, number in numbers.items()})
     return lines
@@ -201,12 +194,6 @@ def _noise(frame: pd.DataFrame) -> Lines:
 
 def _setting(cells: pd.DataFrame) -> str:
     return "{}, {} views, {}".format(*cells[[*KEYS[:3]]].iloc[0])
-
-
-def _benchmark(cells: pd.DataFrame) -> tuple[str | None, int]:
-    """The paper's benchmark that all these cells are from, and its number of views."""
-    benchmarks = {(benchmark_of(scene, views), views) for (scene, views), _ in grouped(cells, *KEYS[:2])}
-    return benchmarks.pop() if len(benchmarks) == 1 else (None, 0)
 
 
 def _spread(psnr: "pd.Series[float]") -> dict[str, str]:

@@ -47,7 +47,7 @@ def test_a_backend_that_is_wrong_or_fails_is_told_and_is_a_failure(monkeypatch, 
 
 def test_what_is_not_installed_is_no_failure(monkeypatch, capsys):
     real = check.find_spec
-    monkeypatch.setattr(check, "_is_there", lambda *_: False)  # no backend is measured
+    monkeypatch.setattr(check, "_examine", lambda *_: ("", True))  # no backend is measured
     monkeypatch.setattr(check, "find_spec", lambda name: None if name == "pycolmap" else real(name))
     assert check.check(device="cpu") == 0
     assert 'photos without cameras (pip install -e ".[sfm]" in a clone of kgs' in capsys.readouterr().out

@@ -148,12 +148,10 @@ def test_the_report_has_a_line_for_each_scene_with_its_seeds(tmp_path):
     whole = {"psnr": 25.0, "lpips_vgg_unscaled": 0.1}
     common = {"test": whole, "train": whole, "gaussians": 9, "wall_seconds": 2.0, "revision": "abc"}
     far = {"share": 0.5, "psnr": 20.0, "lpips": None}
-    rows = [
-        {"cell": beyond._cell("room", 3, seed), "result": common | {"beyond": {str(k): far for k in beyond.OUT}}}
-        for seed in range(2)
-    ]
+    inside, *_ = cells = beyond_cells(None)
+    rows = [{"cell": cell, "result": common | {"beyond": {str(k): far for k in beyond.OUT}}} for cell in cells[:2]]
     seen = {"seen": {"psnr": 22.0, "share": 0.7}, "beyond": {}}
-    rows.append({"cell": beyond._cell("llff/fern", 3, 0), "result": common | seen})
+    rows.append({"cell": inside | {"scene": "llff/fern"}, "result": common | seen})
     text = write_beyond(rows, tmp_path / "new", "COMMAND", 15)
     assert (tmp_path / "new" / "beyond.md").read_text(encoding="utf-8") == text.rstrip() + "\n"
     assert "3 of 15 cells; by commit of kgs: 3 abc" in text

@@ -64,8 +64,7 @@ def test_each_cell_is_there_once_and_is_a_fit(preset, guarded):
     assert len({json.dumps(cell, sort_keys=True) for cell in cells}) == len(cells)
     for method, settings in {cell["method"]: cell["fit"] for cell in cells}.items():
         assert all(cell["fit"] == settings for cell in cells if cell["method"] == method)
-        fit, _ = cells_module._split({key: value for key, value in settings.items() if key != "preset"})
-        config = FitConfig.from_dict(FitConfig().to_dict() | fit)
+        config, _ = cells_module.fit_config("dense", 0, settings)
         assert config.drop == METHODS[method].get("drop", FitConfig().drop)
 
 

@@ -15,8 +15,8 @@ from kgs.study.command import study
 from kgs.study.grid import read_rows, run_grid
 from kgs.study.overfitting import coadaptation
 from kgs.study.pairs import cells_frame
-from kgs.study.paper_tables import cells_of_table
 from kgs.study.presets import select, sparse_cells, with_steps
+from kgs.study.published import cells_of_table
 from kgs.study.report import write_report
 from kgs.study.rivals import SelectiveDrop, opacity_l1
 

@@ -6,8 +6,7 @@ import pytest
 
 from kgs.study import presets
 from kgs.study.command import study
-from kgs.study.paper_tables import TABLES, cells_of_table
-from kgs.study.published import PUBLISHED, published
+from kgs.study.published import PUBLISHED, TABLES, cells_of_table, published
 
 RATES = [f"{schedule} {rate}" for schedule in ("progressive", "fixed") for rate in (0.1, 0.2, 0.3)]
 PENALTIES = [f"L1 {by} {weight}" for by in ("gradient", "distance") for weight in (0.001, 0.01)]

@@ -102,13 +102,9 @@ def test_every_part_of_the_study_gives_sound_files(case, report):
     assert page.count("<tr>") == len(tables) - sum(line.startswith("| ---") for line in tables)
 
 
-def test_methods_are_told_apart():
+def test_each_method_has_a_look_of_its_own_and_a_table():
     assert len(set(STYLES.values())) == len(STYLES)
-    assert STYLES.keys() == METHODS.keys()  # of the study
-
-
-def test_each_method_has_a_table():
-    assert {*MAIN, *(name for family in FAMILIES.values() for name in family)} == METHODS.keys()
+    assert STYLES.keys() == METHODS.keys() == {*MAIN, *(name for family in FAMILIES.values() for name in family)}
 
 
 @pytest.mark.parametrize(

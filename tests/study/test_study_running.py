@@ -63,7 +63,7 @@ def test_on_a_terminal_each_cell_is_a_bar_until_it_is_done(monkeypatch):
     pytest.importorskip("tqdm")
     screen = Terminal()
     monkeypatch.setattr(sys, "stderr", screen)
-    shown = Running()
+    shown = Running(lambda line: screen.write(f"{line}\n"))
     for key in ("a", "b"):
         shown.begin(key, f"cell {key}")
     shown.hear(told(30, key="a"))
@@ -71,8 +71,7 @@ def test_on_a_terminal_each_cell_is_a_bar_until_it_is_done(monkeypatch):
     assert (bar.n, bar.total) == (30, 100)
     shown.hear(told(2, key="a"))  # its worker died, and another one does it
     assert (bar.n, bar.total) == (2, 100)
-    with shown.aside():
-        screen.write("a line\n")
+    shown.say("a line")
     for key in ("a", "b"):
         shown.end(key)
     assert bar.disable  # closed
