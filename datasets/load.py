@@ -323,10 +323,10 @@ def _views(
     views = []
     for j, scale in enumerate(scales):
         opaque = torch.ones(1, *scale.size, dtype=torch.float32)
-        alpha = torch.stack([alphas[j].get(i, opaque) for i in range(count)]) if alphas[j] else None
+        stacked = torch.stack([alphas[j].get(i, opaque) for i in range(count)]) if alphas[j] else None
         every = opaque[0] > 0
         valid_mask = torch.stack([valid[j].get(i, every) for i in range(count)]) if valid[j] else None
         cameras = pinhole_cameras(extrinsics, intrinsics[j], *scale.size[::-1])
         turns = tuple(turned) if any(turned) else None
-        views.append(Views(cameras, images[j], names, alpha, valid_mask=valid_mask, turned=turns))
+        views.append(Views(cameras, images[j], names, stacked, valid_mask=valid_mask, turned=turns))
     return views
