@@ -20,6 +20,7 @@ from .images import Intrinsics
 from .masks import Mask
 
 LARGEST = 1e15  # a scene's numbers: squares of them are finite in float32
+SMALLEST = 1e-8  # of the way between cameras: below it depths are lost beside the constants of a render
 SHORTEST_FOCAL = 0.1  # of the side: shorter ones are no pixels, but shares of the side
 _ROUNDED = 2e-3  # of the products of axes: what rounding to three digits leaves; `load_scene` makes them orthonormal
 

@@ -20,7 +20,7 @@ from kgs.geometry.cameras import pinhole_cameras
 
 from .border import with_border
 from .folders import CAMERAS_REPORT
-from .frames import LARGEST, Frame, FrameSet
+from .frames import LARGEST, SMALLEST, Frame, FrameSet
 from .image_file import color_notes
 from .images import rectification, remap, resize
 from .mask_files import find_mask_files
@@ -119,7 +119,12 @@ def load_scene(
             count = len(train) + len(test)
             raise DataError(root, "", f"{count} images", count - len(missing), advice=f"there is no {names}")
         color = torch.tensor(BACKGROUNDS[background], dtype=torch.float32)
-        offset = torch.stack([frame.pose[:3, 3] for frame in train]).mean(dim=0)  # float64; without the test views
+        centers = torch.stack([frame.pose[:3, 3] for frame in train])
+        spread = float((centers.amax(0) - centers.amin(0)).max())
+        if 0 < spread < SMALLEST:
+            expected = f"cameras in one place, or at least {SMALLEST:g} apart"
+            raise DataError(root, "poses", expected, f"{spread:.2g}", advice="scale poses and points up")
+        offset = centers.mean(dim=0)  # float64; without the test views
         first = _usual(train)
         scales = [_Scale.of(first, downscale or 1.0)]
         height, width = scales[0].size

@@ -163,3 +163,18 @@ def test_test_views_of_the_files_can_be_trained_on(tmp_path: Path) -> None:
     assert len(everything.test) == 0
     assert set(everything.train.names) == {*given.train.names, *given.test.names}
     assert len(load_scene(tmp_path, 2, hold_out=0).train) == 2
+
+
+@pytest.mark.parametrize(("scale", "is_refused"), [(0.0, False), (3e-9, True), (3e-8, False)])
+def test_cameras_that_float32_cannot_tell_apart_are_refused(tmp_path: Path, scale: float, is_refused: bool) -> None:
+    """But for those of a panorama, which are in one place."""
+    write_llff(tmp_path)
+    path = tmp_path / "poses_bounds.npy"
+    rows = np.load(path)
+    rows[:, 3] *= scale
+    np.save(path, rows)
+    if is_refused:
+        with refused(DataError, path=tmp_path, key="poses"):
+            load_scene(tmp_path)
+    else:
+        assert len(load_scene(tmp_path, hold_out=0).train) == 3
