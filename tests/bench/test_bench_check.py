@@ -45,6 +45,13 @@ def test_a_backend_that_is_wrong_or_fails_is_told_and_is_a_failure(monkeypatch, 
     assert "WRONG: ZeroDivisionError: division by zero" in capsys.readouterr().out
 
 
+def test_gradients_that_are_not_finite_are_a_failure(monkeypatch, capsys):
+    errors = torch.tensor([0.0, torch.nan, 0.0])
+    monkeypatch.setattr(check, "relative_errors", lambda *_: errors)
+    assert check.check(device="cpu") == 1
+    assert "WRONG: expected at most 5e-05 (off by nan)" in capsys.readouterr().out
+
+
 def test_what_is_not_installed_is_no_failure(monkeypatch, capsys):
     real = check.find_spec
     monkeypatch.setattr(check, "_examine", lambda *_: ("", True))  # no backend is measured
