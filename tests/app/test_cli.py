@@ -24,10 +24,11 @@ from kgs._support.json_files import write_json
 from kgs.app.cli.fit import first_config
 from kgs.app.cli.run import COMMANDS, load_command
 from kgs.app.cli.tools import explain_import_error, load_package, load_tools
+from kgs.app.details import DETAILS
 from kgs.app.files.fit_files import CHECKPOINT, EXPORTS, FILMS, PREVIOUS
 from kgs.app.files.results import Results
 from kgs.errors import ArgumentError, DataError, PhotosRefused, TrainingDiverged
-from kgs.fit.config import DETAILS, DROP, PAPER, PRESETS, FitConfig
+from kgs.fit.config import DROP, PAPER, PRESETS, FitConfig
 
 COMMAND_PAGE = (Path(__file__).parents[2] / "docs/command.md").read_text(encoding="utf-8")
 QUICK = ("--init", "scene", "--max-gaussians", 3000)

@@ -12,11 +12,11 @@ from kornia.geometry.conversions import rotation_matrix_to_quaternion
 from kgs._support.errors import DataError
 from kgs._support.json_files import write_json
 from kgs.app import sfm
+from kgs.app.details import COARSE, DETAILS
 from kgs.app.files.outputs import write_png
 from kgs.app.sfm.source import Source
 from kgs.datasets import synthetic_scene
 from kgs.datasets.folders import scene_nearby
-from kgs.fit.config import COARSE, DETAILS
 
 SIZE = (72, 96)
 FIT = ("--steps", 6, "--init", "random", "--init-points", 200, "--preset", "plain")
