@@ -169,18 +169,6 @@ def done(measured: Path, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_eval_takes_files_that_were_changed(done: Path, capsys: Any) -> None:
-    """As metrics.json printed by another program, or a page that was edited."""
-    page = (done / "index.html").read_bytes()
-    metrics = json.loads((done / "metrics.json").read_text())
-    (done / "metrics.json").write_text(json.dumps(metrics, indent=8))
-    (done / "index.html").write_text("mine")
-    evaluate(done)
-    assert (done / "index.html").stat().st_size > len(page) // 2
-    assert json.loads((done / "metrics.json").read_text())["steps"] == metrics["steps"]
-    assert "LPIPS" not in capsys.readouterr().out
-
-
 def test_the_scene_and_the_fit_come_back(folder: Path, measured: Path) -> None:
     request, fit = load_fit(measured)
     assert request == SceneRequest(str(folder), 3, background="white", roll=90.0)

@@ -289,13 +289,6 @@ def test_photos_that_are_close_together_take_the_focal_length_of_their_exif(tmp_
     assert any("the Exif says 208 pixels" in line for line in lines)
 
 
-def test_photos_whose_exif_has_a_focal_length_that_no_lens_has(tmp_path):
-    lines, folder = [], write_photos(tmp_path / "photos", small_planes(), [28, 1, 1])
-    report = pose_photos(folder, tmp_path / "out", say=lines.append)
-    assert len(report["photos"]) == 3
-    assert any("no lens has" in line and line.endswith("IMG_2.jpg, IMG_3.jpg") for line in lines)
-
-
 @pytest.mark.slow
 def test_photos_that_tell_the_focal_length_are_believed_more_than_their_exif(tmp_path):
     report = pose_photos(write_photos(tmp_path / "photos", planes(), [40] * 3), tmp_path / "out", say=lambda line: None)
