@@ -233,7 +233,7 @@ class _Line:
         try:
             return tuple(_WORDS[code](word) for code, word in zip(codes, words, strict=True))
         except ValueError as error:
-            raise DataError(self._path, f"line {quoted(self._line)}", "numbers as COLMAP writes them") from error
+            raise DataError(self._path, what, "a line as COLMAP writes it", quoted(self._line)) from error
 
     def string(self, _: str) -> str:
         text, self._left = self._left, ""
