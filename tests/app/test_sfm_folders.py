@@ -1,7 +1,6 @@
 """What a user's folder may hold instead of photos that fit together: what happened, and what to do, is said."""
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -67,15 +66,9 @@ def folder(tmp_path):
 VIDEO = b"\0\0\0\x18ftypisom" + bytes(100)
 FOLDERS = {  # what is in them, and what is said of it
     "notes": (lambda at: save(at, [], notes_txt=b"nothing"), ("expected photos", ".jpg", "Take 3 to 12 photos")),
-    "one": (lambda at: save(at, planes()[:1]), ("at least 3 photos, got 1", "Take 3 to 12")),
-    "too deep": (lambda at: save(at / "DCIM", planes()), ("these folders in it hold some: DCIM",)),
     "too deep, with cameras": (
         lambda at: save(save(at, [], transform_train_json=b"{}") / "images", planes()),
         ("these folders in it hold some: images", "transform_train.json"),
-    ),
-    "raw": (
-        lambda at: save(at, planes(), raw_dng=b"II*\0"),
-        ("got 1 of 4 of another kind (raw.dng)", "sips", "magick", "Most Compatible"),
     ),
     "video called JPEG": (
         lambda at: save(at, planes(), z_jpg=VIDEO),
@@ -234,15 +227,6 @@ def test_walking_forward(tmp_path, refused):
     assert "places between" not in text
 
 
-def test_results_do_not_go_among_the_photos_or_over_another_scene(folder, tmp_path, refused):
-    write_planes(folder)
-    save(tmp_path / "other" / "images", planes())
-    for out in (folder, tmp_path / "other"):
-        before = sorted(out.rglob("*"))
-        refused(folder, "expected a new or empty folder", out=out, code=3)
-        assert sorted(out.rglob("*")) == before
-
-
 def test_photos_that_lie_where_results_go_are_refused(tmp_path, found):
     pose_photos(write_planes(tmp_path / "photos"), tmp_path / "out")
     images = tmp_path / "out" / "images"
@@ -274,37 +258,6 @@ def found(monkeypatch):
 
     monkeypatch.setattr(pose, "find_cameras", find)
     return counts
-
-
-@pytest.mark.parametrize(
-    "name", ["unfinished/notes.txt", "images/notes.txt", "images/deeper/IMG_1.HEIC", "sparse/0/deeper/a.bin", "a.jpg"]
-)
-def test_a_users_own_files_stay(folder, tmp_path, found, name):
-    """Also such as kgs does not read, when new photos take the place of the former ones."""
-    out = tmp_path / "project"
-    pose_photos(write_planes(folder), out)
-    (out / name).parent.mkdir(parents=True, exist_ok=True)
-    (out / name).write_bytes(b"mine")
-    (folder / "IMG_1.png").rename(folder / "IMG_4.png")
-    pose_photos(folder, out)
-    assert sorted(path.name for path in (out / "images").glob("*.png")) == ["IMG_2.png", "IMG_3.png", "IMG_4.png"]
-    assert (out / name).read_bytes() == b"mine"
-
-
-@pytest.mark.parametrize("lost", [".kgs*", ""])
-def test_a_copy_of_the_results_goes_on(folder, tmp_path, found, lost):
-    """Without hidden files, as `cp OUT/* COPY` makes it, nothing in it is known as a file of kgs: it is refused."""
-    pose_photos(write_planes(folder), tmp_path / "out")
-    copy = tmp_path / "copy"
-    shutil.copytree(tmp_path / "out", copy, ignore=shutil.ignore_patterns(lost), copy_function=shutil.copyfile)
-    if lost:
-        with pytest.raises(DataError, match=r"got one with images, photos\.json, sparse"):
-            pose_photos(folder, copy)
-        return
-    assert pose_photos(folder, copy)["reused"]
-    save(folder, planes()[:1, 20:], ["IMG_4.png"])
-    assert not pose_photos(folder, copy)["reused"]
-    assert len(list((copy / "images").iterdir())) == 4
 
 
 def test_other_masks_make_other_cameras(folder, tmp_path, found):

@@ -5,7 +5,7 @@ import zlib
 
 import numpy as np
 import pytest
-from photo_folders import notes_of, open_photos
+from photo_folders import open_photos
 
 from kgs._support.errors import DataError
 from kgs._support.progress import silent
@@ -90,13 +90,6 @@ def test_without_the_extra_it_is_said_what_to_do(folder, monkeypatch):
         find_photos(folder)
     with pytest.raises(DataError, match=r"IMG_3\.jpg: .* got a HEIC photo or a video"):
         open_photos([folder / "IMG_3.jpg"])
-
-
-def test_of_a_photo_and_its_conversion_the_jpeg_is_taken(folder):
-    (folder / "img_2.jpg").write_bytes(PHOTO)  # what `magick mogrify` leaves beside IMG_2.HEIC
-    assert [path.name for path in find_photos(folder)] == ["IMG_1.heic", "IMG_3.jpg", "img_2.jpg"]
-    (note,) = notes_of(folder)
-    assert "IMG_2.HEIC" in note
 
 
 def test_a_folder_without_photos_names_the_endings_that_are_read(tmp_path, monkeypatch):
