@@ -8,10 +8,26 @@ import re
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
+from typing import NamedTuple
 
 from kgs._support.errors import DataError, listed, quantity
 
-from .layouts import LAYOUTS, POSE_FILES
+
+class Layout(NamedTuple):
+    """How the files of a scene lie in its folder."""
+
+    file: str = ""  # says where the cameras are; "": a COLMAP model does
+    has_sizes: bool = False  # the same photos may be there in several sizes, a folder for each
+
+
+# In the order in which they are looked for. The function `load` in layouts/x.py reads layout X.
+LAYOUTS = {
+    "LLFF": Layout("poses_bounds.npy", has_sizes=True),
+    "COLMAP": Layout(has_sizes=True),
+    "Blender": Layout("transforms_train.json"),
+    "nerfstudio": Layout("transforms.json"),
+}
+POSE_FILES = tuple(layout.file for layout in LAYOUTS.values() if layout.file)
 
 _JPEG = (".jpg", ".jpeg", ".jpe", ".jfif", ".jif", ".pjpeg", ".pjp")
 IMAGE_SUFFIXES = (".png", *_JPEG, ".webp", ".bmp", ".dib", ".tif", ".tiff")

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 from kgs._support.errors import DataError
 
-from .folders import layout_of, no_scene, unused_files
-from .layouts import LAYOUTS
+from .folders import LAYOUTS, layout_of, no_scene, unused_files
 
 if TYPE_CHECKING:
     from .frames import FrameSet

@@ -10,8 +10,7 @@ from kornia.geometry import camtoworld_vision_to_graphics_4x4
 from kgs._support.json_files import read_json, write_json
 from kgs.app.files.outputs import write_png
 from kgs.datasets import synthetic_scene
-from kgs.datasets.folders import CAMERAS_REPORT
-from kgs.datasets.layouts import LAYOUTS
+from kgs.datasets.folders import CAMERAS_REPORT, LAYOUTS
 
 PHOTOS = Path(__file__).parent / "demo_photos"  # six training photos, two held out, and their cameras
 CREDIT = "Photos: Piero Toffanin, dataset_banana (MIT licence)."
