@@ -1,4 +1,4 @@
-"""What the benchmarks write: tables in Markdown, CSV and JSON, plots, and a mean with its spread."""
+"""What the benchmarks write: tables in Markdown and CSV, plots, and a mean with its spread."""
 
 import csv
 import math
@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from kgs._support.json_files import write_json
+from kgs._support.errors import quantity
 from kgs._support.machine import versions
 
 Row = dict[str, Any]
@@ -29,14 +29,15 @@ def mean_sd(values: Iterable[float], decimals: int) -> str:
     return f"{statistics.fmean(numbers):.{decimals}f}{spread}" if numbers else "-"
 
 
-def write_results(path: Path, rows: list[Row], tables: str, **more: Any) -> None:
-    """Print the tables, Markdown, and write them as path.md; path.csv: the rows; path.json: the rows and `more`."""
+def write_results(path: Path, rows: list[Row], tables: str) -> None:
+    """Print the tables, Markdown, and write them as path.md, with versions and threads; path.csv: the rows."""
     with path.with_suffix(".csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    more |= {"threads": torch.get_num_threads(), "versions": versions()}
-    write_json(path.with_suffix(".json"), {"rows": rows, **more})
+    *packages, (_, machine) = versions().items()
+    made = f"Made with {', '.join(' '.join(package) for package in packages)}; {machine}, "
+    tables += f"{made}{quantity(torch.get_num_threads(), 'thread')} of torch.\n"
     path.with_suffix(".md").write_text(tables, encoding="utf-8")
     print(tables)
 

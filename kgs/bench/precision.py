@@ -64,7 +64,7 @@ def precision(*, out: Path, quick: bool = False) -> None:
       kgs bench precision -o precision
       kgs bench precision -o precision --quick
 
-    Writes precision.csv, .json and .md, render.png and gradients.png in 5 minutes, with --quick in half a minute.
+    Writes precision.csv and .md, render.png and gradients.png in 5 minutes, with --quick in half a minute.
 
     Args:
         out: folder for the results, made if it is not there.

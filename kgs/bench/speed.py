@@ -45,7 +45,7 @@ def speed(*, out: Path, quick: bool = False, device: str = "cpu") -> None:
       kgs bench speed -o speed
       kgs bench speed -o speed --quick --device cuda
 
-    Writes speed.csv, speed.json, speed.md and scaling.png in minutes, with --quick in tens of seconds.
+    Writes speed.csv, speed.md and scaling.png in minutes, with --quick in tens of seconds.
 
     Args:
         out: folder for the results, made if it is not there.
@@ -83,15 +83,7 @@ def speed(*, out: Path, quick: bool = False, device: str = "cpu") -> None:
     exponents = {name: _exponent(of) for name, of in points.items()}
     panels = {f"by {name}": {"forward + backward": (of, "o-")} for name, of in points.items()}
     write_plot(out / "scaling.png", panels, ylabel="wall time [s]")
-    write_results(
-        out / "speed",
-        rows,
-        _markdown(rows, memory, unit, exponents),
-        peak_memory_mb=memory,
-        exp_s=unit,
-        exponents=exponents,
-        device=device,
-    )
+    write_results(out / "speed", rows, _markdown(rows, memory, unit, exponents))
 
 
 def backends(device: torch.device) -> list[str]:

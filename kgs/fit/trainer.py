@@ -326,7 +326,9 @@ class Trainer:
         if threshold != self.renderer.options.alpha_threshold:
             self.renderer.options = replace(self.renderer.options, alpha_threshold=threshold)
         rate = decayed(recipe.lr_means, recipe.lr_means_final, progress)
-        state.optimizer.param_groups[0]["lr"] = state.start.extent * rate
+        for group in state.optimizer.param_groups:
+            if group["name"] == "means":
+                group["lr"] = state.start.extent * rate
         degree = sum(state.step >= step for step in self.plan.schedule.sh)
         if degree > state.model.sh_degree:  # a finished fit that goes on keeps its degree
             state.model.sh_degree = degree

@@ -24,10 +24,11 @@ from kgs._support.json_files import write_json
 from kgs.app.cli.fit import first_config
 from kgs.app.cli.run import COMMANDS, load_command
 from kgs.app.cli.tools import explain_import_error, load_package, load_tools
+from kgs.app.details import DETAILS
 from kgs.app.files.fit_files import CHECKPOINT, EXPORTS, FILMS, PREVIOUS
 from kgs.app.files.results import Results
 from kgs.errors import ArgumentError, DataError, PhotosRefused, TrainingDiverged
-from kgs.fit.config import DETAILS, DROP, PAPER, PRESETS, FitConfig
+from kgs.fit.config import DROP, PAPER, PRESETS, FitConfig
 
 COMMAND_PAGE = (Path(__file__).parents[2] / "docs/command.md").read_text(encoding="utf-8")
 QUICK = ("--init", "scene", "--max-gaussians", 3000)
@@ -135,11 +136,6 @@ def test_a_fit_at_work_is_not_called_unfinished(folder, tmp_path, capsys):
         assert "kgs is at work" in one_line(capsys)
     assert run("fit", folder, "-o", tmp_path) == 3
     assert "use --resume, or remove it" in one_line(capsys)
-
-
-def test_a_newline_in_a_folders_name_is_escaped(tmp_path, capsys):
-    assert run("eval", tmp_path / "a\nb") == 3
-    assert r"a\nb" in one_line(capsys)
 
 
 def test_presets_and_details_are_starts_that_options_change(folder, tmp_path, monkeypatch):
@@ -359,17 +355,3 @@ def test_a_large_package_that_cannot_be_loaded(monkeypatch):
     bad = ["numba"]
     assert load_tools().type == "cpu"  # torch may do in its place
     assert explain_import_error(ImportError("of ours", name="kgs._support.errors")) == ""
-
-
-@pytest.mark.slow
-def test_a_scene_may_have_one_photo(folder, tmp_path):
-    scene, out = tmp_path / "scene", tmp_path / "out"
-    shutil.copytree(folder / "train", scene / "train")
-    content = json.loads((folder / "transforms_train.json").read_text())
-    frame = content["frames"][0]
-    frame["file_path"] += ".png"
-    (scene / "transforms.json").write_text(json.dumps(content | {"frames": [frame]}))
-    words = ("--init", "random", "--hold-out", 0, "--size", 32, "--steps", 4)
-    assert run("fit", scene, "-o", out, *words) == 0
-    assert run("render", out / "splat.ply", "--cameras", scene, "-o", tmp_path / "renders") == 0
-    assert [path.name for path in (tmp_path / "renders").glob("*.png")] == ["train_r_0.png"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 import sys
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from browser import Browser
-from factories import pinhole, with_camera
+from factories import looking_at, pinhole, with_camera
 from torch import Tensor
 
 from kgs import GaussianRenderer, Gaussians
@@ -23,26 +22,12 @@ from kgs.app.files.film import camera_path, write_film
 from kgs.datasets.scene import Views
 
 
-def looking_at(target: Tensor, centers: Tensor) -> Tensor:
-    """World-to-camera matrices of cameras with these centres that look at the target; the world's z is up."""
-    poses = []
-    for center in centers.double():
-        ahead = (target - center) / (target - center).norm()
-        right = torch.linalg.cross(ahead, torch.tensor([0.0, 0.0, 1.0]).double())
-        right = right / right.norm()
-        turn = torch.stack([right, torch.linalg.cross(ahead, right), ahead])
-        pose = torch.eye(4).double()
-        pose[:3, :3], pose[:3, 3] = turn, -turn @ center
-        poses.append(pose)
-    return torch.stack(poses)
-
-
 def ring(count: int, radius: float = 3.0) -> Tensor:
     """Cameras around the z axis in a scrambled order, at several heights."""
     angles = 2 * math.pi * torch.arange(count).double() / count
     ringed = torch.stack([radius * angles.cos(), radius * angles.sin(), 1 + 0.3 * (3 * angles).sin()], 1)
     order = torch.randperm(count, generator=torch.Generator().manual_seed(count))
-    return looking_at(torch.zeros(3).double(), ringed[order])
+    return looking_at(torch.zeros(3), ringed[order], torch.tensor([0.0, 0.0, 1.0]))
 
 
 def facing(count: int) -> Tensor:
@@ -128,18 +113,6 @@ def test_the_camera_moves_at_one_speed_between_the_ends(poses: Tensor) -> None:
     assert (lengths[-20:].diff() < 1e-6 * cruise).all()
     assert (lengths.diff().abs() < 0.25 * cruise).all()  # no jolt
     torch.testing.assert_close(path[0], camera_path(poses, evenly(1), 3.0)[0])
-
-
-def test_an_even_path_takes_each_step_in_the_same_time() -> None:
-    """Against the plain round of a circle: 86 % of the way at one speed, the rest at half of it on the mean."""
-    count, frames = 12, 240
-    rim = 2 * math.pi * torch.arange(count).double() / count
-    poses = looking_at(torch.zeros(3).double(), torch.stack([rim.cos(), rim.sin(), 0.3 * torch.ones(count)], 1))
-    positions = centers(film.resample_by_speed(poses, frames, 1.0))
-    steps = torch.atan2(positions[:, 1], positions[:, 0]).diff().remainder(2 * math.pi)
-    steps = torch.minimum(steps, 2 * math.pi - steps)
-    expected = 2 * math.pi / frames * (0.86 + 2 * 0.14)
-    torch.testing.assert_close(steps[40:200], torch.full((160,), expected).double(), rtol=0.02, atol=0)
 
 
 @pytest.mark.parametrize(("count", "bound"), [(12, 1.2), (40, 1.3)])
@@ -291,36 +264,6 @@ def test_each_frame_has_its_time(tmp_path: Path, suffix: str) -> None:
     assert times == pytest.approx([i / 24 for i in range(60)], abs=1e-4 if suffix == ".mp4" else 5e-4)
 
 
-def test_frames_are_made_while_others_are_encoded(tmp_path: Path, monkeypatch: Any, suffix: str) -> None:
-    """The second frame is made before the first one is encoded, which waits for it; no more than a few are ahead."""
-    made: list[int] = []
-    encoded: list[int] = []
-    ahead: list[int] = []
-    second = threading.Event()
-    write = encoders._in_thread
-
-    def frames() -> Any:
-        for i in range(30):
-            made.append(i)
-            if i == 1:
-                second.set()
-            ahead.append(len(made) - len(encoded))
-            yield np.full((48, 64, 3), 8 * i, np.uint8)
-
-    def watched(work: Any, frames: Any) -> int:
-        def slowly(frame: Any) -> None:
-            assert second.wait(20)
-            work(frame)
-            encoded.append(frame[0, 0, 0] // 8)
-
-        return write(slowly, frames)
-
-    monkeypatch.setattr(encoders, "_in_thread", watched)
-    assert encoders.encode(tmp_path / f"a{suffix}", frames(), (64, 48)) == ""
-    assert encoded == made == list(range(30))
-    assert max(ahead) <= 8
-
-
 @pytest.mark.parametrize("last", [0, 2, 9])
 def test_an_error_of_the_encoder_reaches_the_caller(last: int) -> None:
     """Also of the last frame, after which no other one is made; and no frame comes after it."""
@@ -336,40 +279,30 @@ def test_an_error_of_the_encoder_reaches_the_caller(last: int) -> None:
     assert encoded[: last + 1] == list(range(last + 1))
 
 
-def test_without_pyav_films_are_webm(tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setitem(sys.modules, "av", None)
-    assert encoders.film_suffix() == ".webm"
-    assert write_film(tmp_path / "a.mp4", render, views_of((12, 16)), 1.0).startswith("no a.mp4: ")
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("codec", ["h264_nothing", "h264_v4l2m2m"])
-def test_without_an_encoder_that_works_films_are_webm(tmp_path: Path, monkeypatch: Any, codec: str) -> None:
-    """One that FFmpeg does not have, and one of a device that is not there."""
-    pytest.importorskip("av")
-    monkeypatch.setattr(encoders, "_H264", codec)
-    assert encoders.film_suffix() == ".webm"
-    assert write_film(tmp_path / "a.mp4", render, views_of((12, 16)), 1.0).startswith("no a.mp4: ")
-    assert list(tmp_path.iterdir()) == []
-
-
 def no_session(*_: Any, **__: Any) -> None:
     raise pytest.importorskip("av").error.ExternalError(1, "no session left")
 
 
 @pytest.mark.parametrize(
-    ("name", "broken", "by", "reason"),
+    ("name", "replaced", "by", "reason"),
     [
+        ("a.mp4", None, None, "no a.mp4: it needs PyAV"),
+        ("a.mp4", "kgs.app.files.encoders._H264", "h264_nothing", "no a.mp4: it needs PyAV"),
+        ("a.mp4", "kgs.app.files.encoders._H264", "h264_v4l2m2m", "no a.mp4: it needs PyAV"),  # a device is not there
         ("a.mp4", "av.open", no_session, "no a.mp4: .*no session left"),
         ("a.webm", "cv2.VideoWriter.fourcc", lambda *_: 0, "no a.webm: this OpenCV writes no WebM"),
     ],
-    ids=["encoder", "codec"],
+    ids=["package", "encoder", "device", "session", "codec"],
 )
 def test_what_fails_leaves_a_reason_and_no_file(
-    tmp_path: Path, monkeypatch: Any, name: str, broken: str, by: Any, reason: str
+    tmp_path: Path, monkeypatch: Any, name: str, replaced: str | None, by: Any, reason: str
 ) -> None:
-    pytest.importorskip("av")
-    monkeypatch.setattr(broken, by)
+    if replaced is None:
+        monkeypatch.setitem(sys.modules, "av", None)
+    else:
+        pytest.importorskip("av")
+        monkeypatch.setattr(replaced, by)
+    assert (encoders.film_suffix() == ".webm") == ("needs" in reason)
     assert re.match(reason, write_film(tmp_path / name, render, views_of((12, 16)), 1.0))
     assert list(tmp_path.iterdir()) == []
 

@@ -17,12 +17,12 @@ from factories import batch, random_camera, random_gaussians, with_camera
 
 import kgs
 from kgs import Gaussians
+from kgs.app.cli.demo import BANANAS
 from kgs.app.page import PageContent, PagePhotos, PageSplat, PageText, Picture, write_page
 from kgs.app.page.fit_page import write_fit_page
 from kgs.app.sfm import pose_photos
 from kgs.datasets import load_scene
 from kgs.datasets.scene import Views
-from kgs.fit.config import DEMO
 from kgs.fit.run import fit_scene
 from kgs.geometry.types import RasterOptions
 
@@ -273,7 +273,7 @@ def test_a_drag_in_a_real_scene_shows_what_kgs_renders(
         pose_photos(kgs_data / name, folder)
     wide = max(load_scene(folder, 6, hold_out=0, photos=False).train.images.shape[-2:])
     real = load_scene(folder, 6, wide / 200, hold_out=0)
-    fit = fit_scene(real, replace(DEMO, steps=100, prune=False))
+    fit = fit_scene(real, replace(BANANAS, steps=100, prune=False))
     path = tmp_path / "index.html"
     near_plane = fit.options.near_plane
     write_fit_page(path, name, {"": fit}, photos=False)

@@ -122,6 +122,9 @@ def test_new_results_take_the_place_of_all_former_ones(out: Path) -> None:
     write(out, {"b.txt": "mine"})  # a name that kgs writes is kgs's
     replace_all(out, NEW)
     assert contents(out) == NEW | MINE
+    (out / "test/notes.txt").unlink()
+    replace_all(out, {"a.txt": "new"})
+    assert not (out / "test").exists()
 
 
 def test_some_results_take_the_place_of_their_namesakes_alone(out: Path) -> None:

@@ -4,7 +4,6 @@ import json
 import shutil
 import sys
 
-import numpy as np
 import pytest
 import torch
 from command import one_line, run
@@ -13,11 +12,11 @@ from kornia.geometry.conversions import rotation_matrix_to_quaternion
 from kgs._support.errors import DataError
 from kgs._support.json_files import write_json
 from kgs.app import sfm
+from kgs.app.details import COARSE, DETAILS
 from kgs.app.files.outputs import write_png
 from kgs.app.sfm.source import Source
 from kgs.datasets import synthetic_scene
 from kgs.datasets.folders import scene_nearby
-from kgs.fit.config import COARSE, DETAILS
 
 SIZE = (72, 96)
 FIT = ("--steps", 6, "--init", "random", "--init-points", 200, "--preset", "plain")
@@ -87,12 +86,10 @@ def test_a_folder_of_photos_becomes_a_fit(folder, tmp_path, capsys, monkeypatch)
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     out = tmp_path / "out"
     photos = folder(4)
-    (photos / "reconstruction.json").write_text("{}")
     assert run("fit", photos, "-o", out, *FIT) == 0
     said = capsys.readouterr().out
     stages = ["1 of 5: cameras", "2 of 5: initial points", "3 of 5: fit", "4 of 5: film", "5 of 5: page"]
     assert [line for line in said.splitlines() if " of 5: " in line] == stages
-    assert said.index(stages[0]) < said.index("reconstruction.json") < said.index(stages[1])
     assert "4 training photos of 96x72, none held out" in said
     assert "<title>photos4</title>" in (out / "index.html").read_text(encoding="utf-8")
     assert "no photo was held out" in said
@@ -170,26 +167,6 @@ def test_a_second_fit_measures_a_photo_that_it_leaves_out(folder, tmp_path, caps
     for options in (["--hold-out", 2], ["--views", 3]):
         assert run("fit", photos, "-o", tmp_path / "out", "--measure", *options) == 2
         assert "--measure: expected photos" in one_line(capsys)
-
-
-@pytest.mark.slow
-def test_all_photos_are_trained_on_unless_some_are_held_out(folder, tmp_path):
-    nine = folder(9)
-    assert run("fit", nine, "-o", tmp_path / "all", "--downscale", 3, *FIT) == 0  # of photos of 192x144
-    protocol = json.loads((tmp_path / "all" / "metrics.json").read_text())["protocol"]
-    assert (protocol["test"], protocol["image_size"]) == ([], [48, 64])
-    assert run("fit", nine, "-o", tmp_path / "out", "--hold-out", 4, "--size", 48, *FIT) == 0
-    protocol = json.loads((tmp_path / "out" / "metrics.json").read_text())["protocol"]
-    assert protocol["image_size"] == [36, 48]
-    cameras = {
-        view["img_name"]: view["position"] for view in json.loads((tmp_path / "out" / "cameras.json").read_text())
-    }
-    held_out = protocol["test"]
-    assert held_out
-    centers = np.array(list(cameras.values()))
-    along = (centers - centers.mean(0)) @ np.linalg.svd(centers - centers.mean(0))[2][0]
-    ends = [list(cameras)[int(i)] for i in (along.argmin(), along.argmax())]
-    assert not {*held_out} & {*ends}
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """The benchmark of speed measures what it says; how fast anything is, is no test."""
 
-import json
-import math
+import csv
 import subprocess
 import time
 
@@ -98,14 +97,14 @@ def test_the_files_are_written(tmp_path, monkeypatch):
     monkeypatch.setattr(speed, "SIZE", (36, 48))
     monkeypatch.setattr(speed, "_memory_of_its_own", lambda *_: 1.0)
     speed.speed(out=tmp_path / "new", quick=True)
-    result = json.loads((tmp_path / "new" / "speed.json").read_text())
     names = {path.name for path in (tmp_path / "new").iterdir()}
-    assert names == {"speed.csv", "speed.json", "speed.md", "scaling.png"}
-    assert {row["table"] for row in result["rows"]} == {"main", "busy", "stages", "left out", "scaling"}
-    main = [row for row in result["rows"] if row["table"] == "main"]
+    assert names == {"speed.csv", "speed.md", "scaling.png"}
+    with (tmp_path / "new" / "speed.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {row["table"] for row in rows} == {"main", "busy", "stages", "left out", "scaling"}
+    main = [row for row in rows if row["table"] == "main"]
     assert {row["case"] for row in main} > set(speed.TARGETS) - {"peak memory", "busy"}
     assert {row["backend"] for row in main} == set(speed.backends(torch.device("cpu")))
-    assert all(math.isfinite(value) for value in result["exponents"].values())
     page = (tmp_path / "new" / "speed.md").read_text()
     assert "| forward + backward, torch |" in page
     assert "| forward + backward, torch, wall beside two busy processes over that |" in page

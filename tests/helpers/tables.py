@@ -24,7 +24,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--tables",
         type=Path,
         metavar="FOLDER",
-        help="print the tables of tests/faults and stiff, and write them as Markdown, CSV and JSON into FOLDER",
+        help="print the tables of tests/faults and stiff, and write them as Markdown and CSV into FOLDER",
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -54,11 +53,8 @@ def test_files_lines_and_a_missed_bound(
     met = cases()[0]
     monkeypatch.setattr(module, "cases", lambda: [met, {**met, "forward_float32": 1e-9}])
     assert extremes(out=tmp_path / "new") == 1
-    result = json.loads((tmp_path / "new" / "extremes.json").read_text())
-    assert [row["verdict"] for row in result["rows"]] == ["met", "met", "MISSED", "met"]
-    assert result["missed"] == 1
     with (tmp_path / "new" / "extremes.csv").open() as file:
-        assert len(list(csv.DictReader(file))) == 4
+        assert [row["verdict"] for row in csv.DictReader(file)] == ["met", "met", "MISSED", "met"]
     page = (tmp_path / "new" / "extremes.md").read_text()
     assert page.count("MISSED") == 1
     assert page.count("| ordinary |") == 2

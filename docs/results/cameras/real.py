@@ -17,7 +17,7 @@ from kgs.app.sfm import pose_photos
 from kgs.app.sfm.find import find_photos
 from kgs.bench.output import markdown_table
 from kgs.datasets import load_scene
-from kgs.study.grid import Cell, read_rows, run_grid
+from kgs.study.grid import Cell, run_grid
 
 FOLDERS = {  # by the name of a set: where its photos are in SCENES, and where their given poses
     "headphones": ("photos/headphones", ""),
@@ -30,7 +30,7 @@ HEADS = "registered", "degrees off", "pixels"
 Rotations = dict[str, NDArray[np.float64]]  # by the stems of the photos' names
 
 
-def cameras(*, out: Path, beside: tuple[Path, ...] = (), processes: int | None = None) -> int:
+def cameras(*, out: Path, processes: int | None = None) -> int:
     """How many real photos are registered, and how far their cameras are from the given ones (20 minutes; can go on).
 
     For example:
@@ -41,7 +41,6 @@ def cameras(*, out: Path, beside: tuple[Path, ...] = (), processes: int | None =
 
     Args:
         out: folder for the results; sets that its sets.jsonl has are not repeated.
-        beside: sets.jsonl of other versions, whose columns come first, under the names of these files.
         processes: sets at a time, one per core unless given.
     """
     cells: list[Cell] = [
@@ -54,7 +53,7 @@ def cameras(*, out: Path, beside: tuple[Path, ...] = (), processes: int | None =
         cells += [{"folder": "fox", "first": first, "step": step, "photos": FEW} for first in starts]
     rows = run_grid(cells, set_cell, out / "sets.jsonl", processes=processes)
     if rows:
-        print(write_sets({**{path.stem: read_rows(path) for path in beside}, "now": rows}, out))
+        print(write_sets(rows, out))
     return int(len(rows) < len(cells))
 
 
@@ -83,25 +82,17 @@ def set_cell(cell: Cell) -> dict[str, Any]:
     }
 
 
-def write_sets(versions: Mapping[str, Sequence[Mapping[str, Any]]], out: Path) -> str:
-    """Write sets.md, which it returns: a row for each set, and three columns for each version."""
-    given = dict[str, int]()
-    columns = {name: dict[str, list[str]]() for name in versions}
-    for version, rows in versions.items():
-        known = {folder: _known(folder, rows) for folder in FOLDERS}
-        for row in rows:
-            cell, result = row["cell"], row["result"]
-            last = cell["first"] + cell["step"] * (result["given"] - 1)
-            name = f"{cell['folder']} {cell['first']}-{last}" + (f" by {cell['step']}" if cell["step"] > 1 else "")
-            given[name] = result["given"]
-            is_measure = not cell["photos"] and not FOLDERS[cell["folder"]][1]
-            columns[version][name] = _columns(result, {} if is_measure else known[cell["folder"]])
-    heads = ["photos", *(f"{head}, {version}" for version in versions for head in HEADS)]
-    lines = [
-        [name, count, *(cell for rows in columns.values() for cell in rows.get(name, [""] * len(HEADS)))]
-        for name, count in given.items()
-    ]
-    text = markdown_table("Cameras of real photos", heads, lines, first="set")
+def write_sets(rows: Sequence[Mapping[str, Any]], out: Path) -> str:
+    """Write sets.md, which it returns: a row for each set."""
+    known = {folder: _known(folder, rows) for folder in FOLDERS}
+    lines = []
+    for row in rows:
+        cell, result = row["cell"], row["result"]
+        last = cell["first"] + cell["step"] * (result["given"] - 1)
+        name = f"{cell['folder']} {cell['first']}-{last}" + (f" by {cell['step']}" if cell["step"] > 1 else "")
+        is_measure = not cell["photos"] and not FOLDERS[cell["folder"]][1]
+        lines.append([name, result["given"], *_columns(result, {} if is_measure else known[cell["folder"]])])
+    text = markdown_table("Cameras of real photos", ("photos", *HEADS), lines, first="set")
     (out / "sets.md").write_text(text, encoding="utf-8")
     return text
 

@@ -24,7 +24,7 @@ from kgs.bench.timing import Case, take_turns
 
 SIZES = {10_000: (378, 504), 50_000: (378, 504), 200_000: (378, 504), 1_000_000: (1080, 1920), 3_000_000: (1080, 1920)}
 REPEATS = 30
-CHECK = "import sys, torch, kgs.backends as b; print(b.resolve('auto', torch.device(sys.argv[1])))"
+CHECK = "import sys, torch, kgs.backends as b; print(b.get_backend('auto', torch.device(sys.argv[1])).name)"
 
 
 def first_uses(device: str) -> list[str]:
