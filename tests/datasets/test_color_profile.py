@@ -10,11 +10,12 @@ import cv2
 import numpy as np
 import PIL.Image
 import pytest
+from photo_folders import open_photos
 from PIL import ImageCms
 from tiny_scenes import png_chunk, read_image, write_colmap
 
 from kgs._support.progress import silent
-from kgs.app.sfm.read import open_photos, read_photos
+from kgs.app.sfm.read import read_photos
 from kgs.datasets import load_scene
 from kgs.datasets.image_file import ImageFile, color_notes
 

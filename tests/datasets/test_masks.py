@@ -14,7 +14,7 @@ from tiny_scenes import update_json, write_colmap, write_llff, write_nerfstudio
 
 from kgs._support.errors import DataError
 from kgs.datasets import load_scene
-from kgs.datasets.mask_files import find_mask_files
+from kgs.datasets.masks import find_masks
 from kgs.datasets.scene import Views
 from kgs.fit.config import FitConfig
 from kgs.fit.measures import measure
@@ -199,7 +199,7 @@ def test_the_folder_of_photos_is_listed_as_often_for_many_masks_as_for_few(
         scans: list[object] = []
         real = os.scandir
         monkeypatch.setattr(os, "scandir", lambda path, scans=scans, real=real: scans.append(path) or real(path))
-        assert len(find_mask_files([root / "images" / "0.png"], root).masks) == 1
+        assert len(find_masks([root / "images" / "0.png"], root).masks) == 1
         monkeypatch.undo()
         seen.append(len(scans))
     assert seen[0] == seen[1] > 0
