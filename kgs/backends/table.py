@@ -77,8 +77,8 @@ class Backend:
             does not cover. A stage may still call torch for a part of its cases, as other lenses.
         activate, project, compositor, blend: the stages of a render.
         loss, loss_gradient, local_moments: of the photometric loss; None where `kgs.losses` computes it in torch.
-        adam_step, add_gradient_norms, decay_opacity: of what a fit does with gradients, in place; all three, or None where
-            `kgs.fit.adam` and `kgs.densify` do it in torch.
+        adam_step, add_gradient_norms, decay_opacity: of what a fit does with gradients, in place: all three, or None
+            where `kgs.fit.adam` and `kgs.densify` do it in torch.
     """
 
     name: str
