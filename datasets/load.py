@@ -1,4 +1,4 @@
-"""`load_scene`: one function for all layouts, and the one place where a scene is built."""
+"""`load_scene`: one function for all layouts, and the one place where a folder becomes a scene."""
 
 import math
 from collections import Counter

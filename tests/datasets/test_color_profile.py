@@ -104,12 +104,6 @@ def test_alpha_stays_and_16_bits_are_converted_too(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_image(tmp_path / "deep.png"), image[..., :3])
 
 
-def test_unposed_photos_are_converted(tmp_path: Path) -> None:
-    paths = [save(tmp_path / f"{i}.png", p3_profile(), np.roll(patches(), 16 * i, axis=0)) for i in range(3)]
-    for i, photo in enumerate(read_photos(open_photos(paths), silent)):
-        np.testing.assert_allclose(photo.pixels, srgb_of_p3(np.roll(patches(), 16 * i, axis=0)), atol=1.5)
-
-
 def exif(space: int | None, index: str = "", more: dict[int, object] | None = None) -> PIL.Image.Exif:
     """Exif that says of the colours: the number of their space, the index of interoperability, other tags."""
     block = PIL.Image.Exif()
