@@ -19,7 +19,7 @@ from .colmap_poses import registered_images
 _LISTED = 20
 
 
-def load_colmap(root: Path, photo_folder: str = "") -> FrameSet:
+def load(root: Path, photo_folder: str = "") -> FrameSet:
     """Read the COLMAP model of a scene, of several the largest one.
 
     Photos that are gone are left out with a note, unless more than half of them are.

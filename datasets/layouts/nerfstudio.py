@@ -54,7 +54,7 @@ _GEOMETRY = re.compile(
 )
 
 
-def load_nerfstudio(root: Path) -> FrameSet:
+def load(root: Path) -> FrameSet:
     """Read `transforms.json`, see :func:`read_transforms`.
 
     `applied_transform` is not undone: the world is the file's. Where the file has `test_filenames` (or else
@@ -130,7 +130,7 @@ def _mask(source: Path, root: Path, values: Values) -> Mask | None:
     path = find_file(source, root, name)
     if not path.is_file():
         raise DataError(source, _field("mask_path", values), "a file", f"{name[:200]!r}, which is not there")
-    return Mask(ImageFile(path))
+    return Mask(path)
 
 
 def _first_size(images: list[ImageFile]) -> tuple[int, int]:

@@ -194,12 +194,14 @@ def mixed(tmp_path_factory):
     mask = np.full(SMALL[::-1], 255, np.uint8)
     mask[:, :HIDDEN] = 0
     write_planes(folder / "masks", [mask, np.rot90(mask), np.full(SMALL[::-1], 255, np.uint8)])
+    (folder / "reconstruction.json").write_text("{}")
     report = pose_photos(folder, root / "out", say=lines.append)
     return folder, root / "out", report, lines
 
 
 def test_the_others_are_registered_as_if_one_of_another_place_was_not_there(posed, mixed):
     folder, out, report, lines = mixed
+    assert "reconstruction.json" in lines[0]
     assert list(report["photos"]) == list(NAMES)
     assert list(report["left_out"]) == ["IMG_4.png"]
     assert sorted(path.name for path in (out / "images").iterdir()) == [*NAMES]

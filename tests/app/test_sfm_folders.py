@@ -11,7 +11,7 @@ import pytest
 from command import run as command
 from init_point_scenes import cameras, texture
 from limits import limited
-from photo_folders import close, planes, write_photos, write_planes
+from photo_folders import close, notes_of, open_photos, planes, write_photos, write_planes
 
 from kgs._support.errors import DataError
 from kgs._support.progress import silent
@@ -19,7 +19,7 @@ from kgs.app.files.results import Results
 from kgs.app.sfm import pose, pose_photos
 from kgs.app.sfm.find import find_photos
 from kgs.app.sfm.pycolmap_processes import PycolmapProcesses
-from kgs.app.sfm.read import open_photos, read_photos
+from kgs.app.sfm.read import read_photos
 from kgs.app.sfm.source import Source
 
 pytest.importorskip("pycolmap")
@@ -135,7 +135,7 @@ def test_a_raw_file_beside_its_photo_is_passed_over(folder, heic, monkeypatch):
     for name in ("0.DNG", "1.dng", "2.HEIC"):
         (folder / name).write_bytes(b"II*\0")
     assert [path.name for path in find_photos(folder)] == ["0.png", "1.png", "2.png"]
-    said = " ".join(Source.unposed(folder).notes(None))
+    said = " ".join(notes_of(folder))
     for name in ("0.DNG", "1.dng", "2.HEIC"):
         assert name in said
 
@@ -148,7 +148,7 @@ def test_a_photo_is_taken_whatever_its_ending_is_called(folder, suffix):
     paths = find_photos(folder)
     assert paths[-1].name == f"3.{suffix}"
     assert len(read_photos(open_photos(paths), silent)) == 4
-    assert not Source.unposed(folder).notes(None)
+    assert not notes_of(folder)
 
 
 @pytest.mark.parametrize("suffix", ["avif", "JXL", "jp2", "gif", "pef", "ppm", "mpo"])
@@ -174,7 +174,7 @@ def test_what_looks_like_a_photo_and_is_not_taken_is_named(folder, refused):
     said = refused(folder.rename(folder.with_name("none")), "these folders in it hold some: more", "IMG_4", code=3)
     fill_with_odd_ones(save(folder, planes()))
     assert [path.name for path in find_photos(folder)] == ["0.png", "1.png", "2.png"]
-    said = " ".join(Source.unposed(folder).notes(None))
+    said = " ".join(notes_of(folder))
     for name in ("IMG_4", ".IMG_5.jpg", "IMG_6.jpg_original", "IMG_9.jpg", "more", "IMG_8.xmp"):
         assert name in said
     for name in ("IMG_7", "notes", "BM.txt", "empty"):
@@ -192,7 +192,7 @@ def test_masks_are_used_and_what_looks_like_one_is_no_photo(folder):
     photos = read_photos(open_photos(paths), silent)
     np.testing.assert_array_equal(photos[0].mask, mask)
     assert photos[1].mask is None
-    (note,) = Source.unposed(folder).notes(None)
+    (note,) = notes_of(folder)
     assert "1_mask.png" in note
 
 
@@ -201,11 +201,11 @@ def test_what_is_called_like_masks_and_is_not_used_is_named(folder):
     lone = ["0 (mask).png", "0_seg.png", "9_mask.png", "mask.png"]
     save(folder, [planes()[0]] * 4, lone)
     assert len(find_photos(folder)) == 7
-    unused, taken = Source.unposed(folder).notes(None)
+    unused, taken = notes_of(folder)
     assert "segmentation" in unused
     assert "--masks" in unused
     assert ", ".join(lone) in taken
-    assert Source.open(folder).notes(folder / "segmentation") == [taken]
+    assert notes_of(folder, folder / "segmentation") == [taken]
 
 
 def test_a_camera_that_only_turned(folder, refused):

@@ -5,11 +5,12 @@ import zlib
 
 import numpy as np
 import pytest
+from photo_folders import open_photos
 
 from kgs._support.errors import DataError
 from kgs._support.progress import silent
 from kgs.app.sfm.find import find_photos
-from kgs.app.sfm.read import open_photos, read_photos
+from kgs.app.sfm.read import read_photos
 from kgs.datasets import folders
 from kgs.datasets.image_file import ImageFile, is_heic
 

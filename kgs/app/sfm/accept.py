@@ -227,7 +227,10 @@ def retry(
     all_photos = set(names.values())
     is_whole = seen_well(found, all_photos) == all_photos
     tries = min(_MAX_TRIES, max(_MIN_TRIES, _REGISTRATIONS // len(names)))
-    for attempt, pair in enumerate(_first_pairs(solver.database, names, photos)[:tries], 1):
+    matches = {pair: len(first) for pair, (first, _) in verified_matches(solver.database).items() if len(first)}
+    pairs = [pair for pair in matches if names.keys() >= {*pair} and not photos.isdisjoint(map(names.get, pair))]
+    pairs.sort(key=lambda pair: -matches[pair])
+    for attempt, pair in enumerate(pairs[:tries], 1):
         at_least = min(len(seen_well(best, all_photos)) + 1, len(names))
         again = solver.solve(names, focals, attempt=attempt, first_pair=pair, at_least=at_least)
         best = max(best, again, key=_merit)
@@ -239,13 +242,6 @@ def retry(
         again = solver.solve(names, focals, start=start, at_least=len(registered) + 1)
         best = max(best, again, key=_merit)
     return best
-
-
-def _first_pairs(database: Path, names: Mapping[str, str], photos: Set[str]) -> list[tuple[str, str]]:
-    """Pairs of images with one of these photos at least, those with most verified matches first."""
-    counts = {pair: len(first) for pair, (first, _) in verified_matches(database).items() if names.keys() >= {*pair}}
-    own = [pair for pair in counts if counts[pair] and not photos.isdisjoint(names[image] for image in pair)]
-    return sorted(own, key=lambda pair: -counts[pair])
 
 
 def _merit(cameras: Cameras) -> tuple[int, int]:

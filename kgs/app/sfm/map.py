@@ -6,10 +6,7 @@ were measured (docs/results/cameras). Each step runs on one thread, so that the 
 
 import copy
 import math
-import signal
-import threading
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mode
@@ -18,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .colmap import pycolmap
 from .pycolmap_processes import check_space
 
 MAX_ERROR = 1.5  # largest reprojection error, in pixels
@@ -47,23 +45,6 @@ class Cameras(NamedTuple):
 
 
 NO_CAMERAS = Cameras({}, {}, {}, {}, None, 0.0)  # of a solver that registered no photo
-
-
-@contextmanager
-def quiet_pycolmap() -> Iterator[Any]:
-    """The module pycolmap with a silent log, and with the handler of SIGTERM that was there before."""
-    main = threading.current_thread() is threading.main_thread()
-    before = signal.getsignal(signal.SIGTERM)
-    import pycolmap
-
-    if main and before is not None:
-        signal.signal(signal.SIGTERM, before)
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
-    try:
-        yield pycolmap
-    finally:
-        pycolmap.logging.minloglevel = level
 
 
 @dataclass(frozen=True)
@@ -99,8 +80,6 @@ class Solver:
                 triangulated again, from the matches of the database, and then the cameras are adjusted to these.
             at_least: how many photos have to be registered; where the first round registers fewer, there are none.
         """
-        import pycolmap
-
         best = None
         error = 0.0
         is_held = len(focals) > 0
@@ -149,8 +128,6 @@ class Solver:
 
     def _map_from(self, start: Any, options: Any) -> Any:
         """The reconstruction of the photos whose cameras are known, and of those that its points then register."""
-        import pycolmap
-
         known = self.work / "start"
         known.mkdir(parents=True, exist_ok=True)
         points = pycolmap.triangulate_points(start, self.database, self.images, known, options=options)
@@ -159,8 +136,6 @@ class Solver:
 
     def _run_mapper(self, options: Any, start: str | Path = "") -> Any:
         """The reconstruction with most registered photos, or None. The mapper goes on from `start`."""
-        import pycolmap
-
         try:
             scenes = pycolmap.incremental_mapping(self.database, self.images, self.work, options, start)
         except (RuntimeError, ValueError):  # the mapper gives up
@@ -186,8 +161,6 @@ def cameras_of(reconstruction: Any, names: Mapping[str, str], focal_rise: float)
 
 def _mapper_options(images: list[str], seed: int) -> Any:
     """The settings with which the mapper registers these images of a database."""
-    import pycolmap
-
     options = pycolmap.IncrementalPipelineOptions()
     options.image_names = images
     options.num_threads = options.mapper.num_threads = 1
@@ -210,8 +183,6 @@ def _mapper_options(images: list[str], seed: int) -> Any:
 
 def _reconstruction(file: Any, cameras: Cameras, names: Mapping[str, str]) -> Any:
     """A reconstruction with these cameras and the keypoints of a database; its points are still to be found."""
-    import pycolmap
-
     scene = pycolmap.Reconstruction()
     ids = {image.name: image.image_id for image in file.read_all_images()}
     for lens in cameras.reconstruction.cameras.values():
@@ -269,8 +240,6 @@ def _bundle_adjust(
         factor: by which focal lengths are multiplied first.
         distortion: at which the radial distortions are held instead.
     """
-    import pycolmap
-
     scene = copy.deepcopy(reconstruction)
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .colmap import pycolmap
 from .find import MIN_PHOTOS
 from .map import MAX_ERROR
 
@@ -32,8 +33,6 @@ class PairGeometry(NamedTuple):
 
 def verified_matches(database: Path) -> dict[tuple[str, str], tuple[Pixels, Pixels]]:
     """Where the verified matches of each pair are in its two images, by the names that these have in a database."""
-    import pycolmap
-
     matches = {}
     with pycolmap.Database.open(database) as file:
         images = {image.image_id: image.name for image in file.read_all_images()}

@@ -24,6 +24,7 @@ from kgs.app.files.outputs import png_names
 from kgs.app.files.results import Results
 from kgs.datasets.folders import CAMERAS_REPORT as REPORT
 from kgs.datasets.image_file import color_notes
+from kgs.datasets.masks import find_masks
 
 from .accept import (
     FOCAL_RANGE,
@@ -35,7 +36,8 @@ from .accept import (
     accepted_cameras,
     say_left_out,
 )
-from .map import Cameras, quiet_pycolmap
+from .find import notes_on
+from .map import Cameras
 from .match import exif_focal
 from .pycolmap_processes import check_space
 from .read import FILM_DIAGONAL, OpenPhoto, Photo, blurred, open_photos, read_photos, unlike_others
@@ -128,16 +130,17 @@ def pose(
     """
     if source.video is not None:
         return _pose_video(source.video, results, frames, seed=seed, masks=masks, for_fit=for_fit, bar=bar, say=say)
-    with quiet_pycolmap():  # a missing package is an error before any work
-        pass
     if source.path.resolve().is_relative_to(results.out.resolve()):
         raise DataError(results.out, "", "another folder than that of the photos", advice="choose another folder")
-    opened = open_photos([*source.photos], masks)
+    mask_files = find_masks(source.photos, source.path, masks)
+    for note in notes_on(source.path, source.photos, mask_files):
+        say(note)
+    opened = open_photos(source.photos, mask_files)
     inputs = {
         "settings": SETTINGS,
         "seed": seed,
         "sha256": {photo.name: photo.sha256 for photo in opened},
-        "masks_sha256": {photo.name: sha256(photo.mask.file.load()).hexdigest() for photo in opened if photo.mask},
+        "masks_sha256": {photo.name: sha256(photo.mask.load()).hexdigest() for photo in opened if photo.mask},
     }
     for folder in (results.work, results.out) if for_fit else (results.out,):
         if (report := _reusable_report(folder, inputs)) is not None:
@@ -212,7 +215,7 @@ def find_cameras(
     names = {image: name for name, image in png.items()}
     work = new / "work"
     work.mkdir(parents=True)
-    with quiet_pycolmap(), _one_thread(), report_full_disk(new):
+    with _one_thread(), report_full_disk(new):
         photos = read_photos(opened, bar)
         unsharp = [photo.name for photo in blurred(photos)]
         _say_notes(opened, photos, unsharp, say)

@@ -27,8 +27,7 @@ from kgs.app.files.encoders import NOT_UTF8, for_opencv
 from kgs.app.files.outputs import write_png
 
 from .find import MAX_FRAMES, MIN_PHOTOS
-from .match import DEFAULT_FOCAL
-from .read import sharpness
+from .read import DEFAULT_FOCAL, sharpness
 
 FRAMES = 12
 MIN_DEGREES = 3.0  # between neighbours

@@ -13,6 +13,7 @@ from kgs._support.errors import DataError
 from kgs.app.files.outputs import write_png
 from kgs.datasets.layouts.colmap_model import read_cameras, read_images, read_points
 
+from .colmap import pycolmap
 from .map import Cameras, cameras_of
 from .pycolmap_processes import check_space
 from .read import Photo
@@ -50,8 +51,6 @@ def upright(cameras: Cameras, turned: set[str], names: Mapping[str, str]) -> Cam
     """
     if turned.isdisjoint(cameras.rotations):
         return cameras
-    import pycolmap
-
     scene = cameras.reconstruction
     found = pycolmap.Reconstruction()
     count = max(scene.cameras)
@@ -89,8 +88,6 @@ def level_and_scale(cameras: Cameras) -> None:
         OpenCV's axes: afterwards y points down and, for the first photo, z forward as far as that is level. The origin
         is the mean of the cameras' centres.
     """
-    import pycolmap
-
     scene = cameras.reconstruction
     names = list(cameras.rotations)
     first = cameras.rotations[names[0]]
