@@ -300,20 +300,20 @@ def test_quiet_says_nothing_and_open_shows_the_page(folder, tmp_path, capsys, mo
 
 def test_a_package_that_cannot_be_loaded_is_one_line(tmp_path, capsys, monkeypatch):
     """As a shared library that it lacks leaves it."""
-    home, photos = tmp_path / "broken" / "pycolmap", tmp_path / "photos"
+    home, photos = tmp_path / "broken" / "jinja2", tmp_path / "photos"
     home.mkdir(parents=True)
     (home / "__init__.py").write_text("from .core import x")
     (home / "core.py").write_text("raise ImportError('libx.so.1: cannot open shared object file\\nSee the manual.')")
     photos.mkdir()
     for i in range(3):
         cv2.imwrite(str(photos / f"{i}.png"), np.full((20, 20, 3), i, np.uint8))
-    for name in [name for name in sys.modules if name.partition(".")[0] == "pycolmap"]:
+    for name in [name for name in sys.modules if name.partition(".")[0] == "jinja2"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.syspath_prepend(home.parent)
     monkeypatch.setattr("importlib.metadata.packages_distributions", dict)
     assert run("fit", photos, "-o", tmp_path / "out") == 1
-    said = "pycolmap is installed, but cannot be loaded (libx.so.1: cannot open shared object file): run pip install"
-    assert one_line(capsys) == f"kgs: {said} --force-reinstall pycolmap (of the extra sfm)"
+    said = "jinja2 is installed, but cannot be loaded (libx.so.1: cannot open shared object file): run pip install"
+    assert one_line(capsys) == f"kgs: {said} --force-reinstall jinja2 (of the extra app)"
     assert not (tmp_path / "out").exists()
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import pytest
 import torch
-from command import run
+from command import one_line, run
 from epipolar import sampson_distances
 from PIL import Image
 
@@ -137,6 +137,11 @@ def test_a_page_measures_at_the_size_of_the_fit_unless_told_otherwise(demo, tmp_
         assert run("page", ply, "--cameras", demo, "-o", tmp_path / "a.html", *options) == 0
         level = re.search(rf"8 photos of {size}, PSNR ([\d.]+)", capsys.readouterr().out)[1]
         assert (float(level) == pytest.approx(mean, abs=0.02)) == (not options)
+
+
+def test_a_fit_to_a_scene_does_not_go_beside_the_photos_of_another(demo, folder, capsys):
+    assert run("fit", folder, "-o", demo) == 3
+    assert "expected a folder for fit, got one of kgs with photos" in one_line(capsys)
 
 
 def test_the_room_is_a_scene_without_photos_of_others(tmp_path, capsys, points, monkeypatch):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from factories import random_model
+from tiny_scenes import write_llff
 
 import kgs
 from kgs import GaussianRenderer, save_ply
@@ -12,7 +13,7 @@ from kgs._support.errors import DataError
 from kgs.app.cli.page import page
 from kgs.app.cli.render import render
 from kgs.app.page import pictures
-from kgs.datasets import load_scene, synthetic_scene
+from kgs.datasets import load_scene
 from kgs.datasets.image_file import ImageFile
 
 
@@ -28,15 +29,9 @@ def splat(tmp_path_factory):
 @pytest.fixture
 def llff(tmp_path):
     """An LLFF folder with ten PNGs."""
-    scene = synthetic_scene(train_views=8, test_views=2, size=(30, 40), seed=0)
     root = tmp_path / "llff"
-    (root / "images").mkdir(parents=True)
-    rows = []
-    for k, image in enumerate([*scene.train.images, *scene.test.images]):
-        cv2.imwrite(str(root / "images" / f"{k}.png"), (image.permute(1, 2, 0) * 255).byte().numpy())
-        pose = np.array([[0, 1, 0, 0.1 * k, 30], [1, 0, 0, 0, 40], [0, 0, -1, 0, 35]], dtype=float)
-        rows.append([*pose.ravel(), 3.0, 8.0])
-    np.save(root / "poses_bounds.npy", np.array(rows))
+    root.mkdir()
+    write_llff(root, 10, (40, 30))
     return root
 
 
