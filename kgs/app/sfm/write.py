@@ -42,13 +42,7 @@ def write_masks(folder: Path, photos: list[Photo], names: list[str]) -> None:
 
 
 def upright(cameras: Cameras, turned: set[str], names: Mapping[str, str]) -> Cameras:
-    """The cameras with those of photos that were turned clockwise turned back: other lenses for these.
-
-    Args:
-        cameras: of photos of one size.
-        turned: the names of photos that were turned.
-        names: the names of all photos by those of their images.
-    """
+    """The cameras with those of photos that were turned clockwise turned back: other lenses for these."""
     if turned.isdisjoint(cameras.rotations):
         return cameras
     scene = cameras.reconstruction
