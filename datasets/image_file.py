@@ -126,17 +126,15 @@ class ImageFile:
         self._data = None
         return to_srgb(np.asarray(pixels / np.float32(2 ** max(8, metadata.bits) - 1), np.float32), metadata.profile)
 
-    @property
-    def is_doubtful(self) -> bool:
-        """Whether its colours are taken for sRGB although its file may mean others."""
-        header = self.metadata
-        is_unnamed = not header.profile and header.tags.get(Base.ColorSpace) == _UNCALIBRATED
-        return is_unnamed or not is_usable(header.profile)
-
 
 def color_notes(images: Sequence[ImageFile]) -> list[str]:
     """A sentence that names photos whose colours may be others than sRGB; or []."""
-    names = [image.path.name for image in images if image.is_doubtful]
+    names = []
+    for image in images:
+        header = image.metadata
+        is_unnamed = not header.profile and header.tags.get(Base.ColorSpace) == _UNCALIBRATED
+        if is_unnamed or not is_usable(header.profile):
+            names.append(image.path.name)
     said = "colours are taken for sRGB, since the colour profile is missing, damaged or of another kind"
     return [f"{said}: {listed(names, _LISTED)}"] if names else []
 

@@ -134,8 +134,11 @@ def camera_path(extrinsics: Tensor, shares: Array, depth: float) -> Tensor:
         of the path, `(frames,)`, is in [0, 1]: 0 is its beginning, a camera, and 1 the same point again, its end.
     """
     poses = torch.linalg.inv(extrinsics.double().cpu())  # camera to world
-    if len(poses) == 1:
-        return _sway(poses[0], shares, depth)
+    if len(poses) == 1:  # a small ellipse beside it, looking at the point at `depth` on its optical axis
+        angles = 2 * torch.pi * torch.from_numpy(shares)
+        right, down, forward = poses[0, :3, :3].T
+        offsets = _SWAY * depth * (angles.sin()[:, None] * right + 0.4 * (1 - angles.cos())[:, None] * down)
+        return _extrinsics(poses[0, :3, 3] + offsets, _looking_at(depth * forward, offsets, down))
     order = _round_trip(_distances(poses))
     order = [order[i] for i in np.linspace(0, len(order), min(_STOPS, len(order)), endpoint=False).astype(int)]
     centers = poses[order, :3, 3]
@@ -163,14 +166,6 @@ def _distances(poses: Tensor) -> Array:
     turned = np.arccos((forward @ forward.T).clip(-1, 1))
     distances: Array = moved / (moved.max() or 1.0) + turned / np.pi
     return distances
-
-
-def _sway(pose: Tensor, shares: Array, depth: float) -> Tensor:
-    """Poses on a small ellipse beside one camera, looking at the point at `depth` on its optical axis."""
-    angles = 2 * torch.pi * torch.from_numpy(shares)
-    right, down, forward = pose[:3, :3].T
-    offsets = _SWAY * depth * (angles.sin()[:, None] * right + 0.4 * (1 - angles.cos())[:, None] * down)
-    return _extrinsics(pose[:3, 3] + offsets, _looking_at(depth * forward, offsets, down))
 
 
 def _looking_at(target: Tensor, centers: Tensor, down: Tensor) -> Tensor:

@@ -77,14 +77,12 @@ def viewer_scene(
     middle = _nearest_mean_pose(rotations, positions / depth, training)
     first = max(middle[: math.ceil(len(middle) / 3)], key=lambda i: (psnr or {}).get(names[i], -math.inf))
     distance = entries[first]["distance"]
-    up = common_up(cameras.extrinsics)
     return {
         "cameras": entries,
         "first": first,
-        "up": up.tolist(),
         "pyramid": _pyramid_depth(positions, depth),
-        "arc": _arc(rotations, positions, first, distance, up.numpy()),
-        "turned": [_turned(cameras, quarters, positions, first, distance) for quarters in (1, 2, 3)],
+        **_up_and_arc(cameras, positions, first, distance),
+        "turned": [_up_and_arc(turned(cameras, quarters), positions, first, distance) for quarters in (1, 2, 3)],
         "tour": _tour(training_cameras(cameras, parts), means),
     }
 
@@ -146,11 +144,11 @@ def _arc(rotations: Array, positions: Array, first: int, distance: float, up: Ar
     }
 
 
-def _turned(cameras: PinholeCamera, quarters: int, positions: Array, first: int, distance: float) -> dict[str, Any]:
-    """What is up, and the arc of the cameras, where all pictures are turned clockwise by some quarters."""
-    poses = turned(cameras, quarters).extrinsics
-    up = common_up(poses)
-    return {"up": up.tolist(), "arc": _arc(poses[:, :3, :3].numpy(), positions, first, distance, up.numpy())}
+def _up_and_arc(cameras: PinholeCamera, positions: Array, first: int, distance: float) -> dict[str, Any]:
+    """What is up for these cameras, and their arc."""
+    up = common_up(cameras.extrinsics)
+    arc = _arc(cameras.extrinsics[:, :3, :3].numpy(), positions, first, distance, up.numpy())
+    return {"up": up.tolist(), "arc": arc}
 
 
 def _widened(low: float, high: float) -> list[float]:
