@@ -45,7 +45,7 @@ def test_model_points_need_two_training_images(tmp_path: Path, text: bool) -> No
 
 
 @pytest.mark.parametrize(("model", "params"), DISTORTED)
-def test_distorted_lenses_become_pinholes(tmp_path: Path, model: str, params: list[float]) -> None:
+def test_convention_lenses_are_those_of_colmap(tmp_path: Path, model: str, params: list[float]) -> None:
     """Ramps say where each pixel comes from; pycolmap's own projection says where it should."""
     pycolmap = pytest.importorskip("pycolmap")
     write_colmap(tmp_path, model=model, params=params)
