@@ -224,6 +224,31 @@ class Densifier:
         )
 
     @torch.no_grad()
+    def add(self, gaussians: GaussianModel) -> None:
+        """Append the Gaussians of another model, with zero Adam moments and no gradients observed.
+
+        The parameters become new objects, as in `step`.
+
+        Raises:
+            TypeError: `gaussians` is not a GaussianModel.
+            ValueError: it has harmonics of another degree, or there would be more than `max_gaussians`.
+        """
+        check_kind("gaussians", gaussians, GaussianModel)
+        self._check()
+        model = self.model
+        if gaussians.max_sh_degree != model.max_sh_degree:
+            raise ArgumentError("gaussians", f"harmonics of degree {model.max_sh_degree}", gaussians.max_sh_degree)
+        total = len(model) + len(gaussians)
+        if self.max_gaussians is not None and total > self.max_gaussians:
+            raise ArgumentError("gaussians", f"at most {self.max_gaussians} with those of the model", total)
+        old_rows = torch.arange(len(model), device=model.means.device)
+        for name, parameter in model.per_gaussian().items():
+            added = gaussians.get_parameter(name).to(parameter)
+            self._replace(name, torch.cat([parameter, added]), old_rows)
+        for name, value in self._statistics.items():
+            self._statistics[name] = torch.cat([value, value.new_zeros(len(gaussians))])
+
+    @torch.no_grad()
     def reset_opacity(self, ceiling: float = 0.01) -> None:
         """Lower all opacities to at most `ceiling`, in (0, 1) (else a ValueError), and zero their moments."""
         if not 0.0 < ceiling < 1.0:

@@ -87,16 +87,16 @@ class GaussianModel(nn.Module):
         self.sh_degree = sh_degree
 
     @classmethod
-    def from_points(cls, points: Tensor, colors: Tensor, sh_degree: int = 3) -> Self:
+    def from_points(cls, points: Tensor, colors: Tensor, sh_degree: int = 3, scales: Tensor | None = None) -> Self:
         """Start from a coloured point cloud: each point becomes an isotropic Gaussian of its colour, with opacity 0.1.
 
-        The standard deviation is the root mean squared distance to the three nearest points, but at least a thousandth
-        of the median over the cloud, because points may coincide.
-
         Args:
-            points: `(N, 3)` in world units, N >= 4, float32 or float64; the model takes their dtype and device.
+            points: `(N, 3)` in world units, float32 or float64; the model takes their dtype and device. N >= 4 without
+                `scales`.
             colors: RGB in [0, 1], `(N, 3)`, floating point.
             sh_degree: the degree of the harmonics, 0 to 3; it is also the active degree.
+            scales: the standard deviations in world units, `(N,)`. None: the root mean squared distance to the three
+                nearest points, but at least a thousandth of the median over the cloud, because points may coincide.
 
         Raises:
             TypeError: `points` is not a tensor of float32 or float64, or `colors` is not floating point.
@@ -117,10 +117,11 @@ class GaussianModel(nn.Module):
         _check_degree(sh_degree, MAX_SH_DEGREE)
         points = points.detach()
         n = len(points)
+        log_scales = log_spacing(points) if scales is None else scales.detach().log()
         return cls(
             means=points,
             quats=points.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
-            log_scales=log_spacing(points).to(points)[:, None].repeat(1, 3),
+            log_scales=log_scales.to(points)[:, None].repeat(1, 3),
             opacity_logits=points.new_full((n,), math.log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY))),
             sh_dc=((colors.detach().to(points) - 0.5) / SH_C0)[:, None],
             sh_rest=points.new_zeros(n, SH_SIZES[sh_degree] - 1, 3),

@@ -92,6 +92,12 @@ def _solve(weights: Tensor, logs: Tensor) -> Tensor:
     return found - found.mean()
 
 
+def before_gain(colors: Tensor, gains: Tensor | None, views: Tensor | None) -> Tensor:
+    """The scene's colours, float32, of those `(P, 3)` in photos `views` `(P,)`; as they are if either is None."""
+    colors = colors.float()
+    return colors if gains is None or views is None else (colors / gains[views]).clamp(0, 1)
+
+
 def with_exposure(scene: Scene, decisions: Decisions) -> Scene:
     """The scene with the gains of its training views that were decided, if any were.
 

@@ -20,6 +20,8 @@ from .exposure import decide_exposure
 from .overlap import FEW, decide_by_overlap, usual_decay
 from .sh_degree import decide_degree
 
+ERROR_POINTS_UNTIL = 0.6  # share of the steps after which no points are added where the error is
+
 
 class Schedule(NamedTuple):
     """The steps at which a fit of a given length does what is due only now and then."""
@@ -27,6 +29,7 @@ class Schedule(NamedTuple):
     steps: int  # all of them
     sh: tuple[int, ...]  # before these one more degree of harmonics is switched on
     densify: tuple[int, ...]  # after these Gaussians are cloned, split and pruned
+    error_points: tuple[int, ...]  # after these, which are densifications, Gaussians are added where the error is
     reset: tuple[int, ...]  # after these all opacities are lowered
     haze: tuple[int, ...]  # after these Gaussians that veil a training view fade
     evaluate: tuple[int, ...]  # after these the curve is measured (before a densification)
@@ -126,10 +129,12 @@ def make_schedule(config: Settings) -> Schedule:
     resets = [*range(spacing, steps, spacing), steps]
     looks = max(50, round(recipe.haze_interval * scale)) if recipe.haze_interval else steps
     evaluations = range(1, config.evaluations + 1)
+    densifications = [s for s in range(interval, steps, interval) if s > round(recipe.densify_from * scale)]
     return Schedule(
         steps=steps,
         sh=tuple(max(1, round(recipe.sh_interval * scale * k)) for k in range(1, config.sh_degree + 1)),
-        densify=tuple(s for s in range(interval, steps, interval) if s > round(recipe.densify_from * scale)),
+        densify=tuple(densifications),
+        error_points=tuple(s for s in densifications if recipe.error_points and s <= ERROR_POINTS_UNTIL * steps),
         reset=tuple(s for s, following in pairwise(resets) if following - s >= recipe.reset_recovery),
         haze=tuple(range(looks, round(0.9 * steps) + 1, looks)),
         evaluate=tuple(sorted({max(1, round(steps * k / config.evaluations)) for k in evaluations})),

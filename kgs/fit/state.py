@@ -24,6 +24,8 @@ from kgs.model import PARAMETERS, GaussianModel
 
 from .adam import Adam
 from .config import Settings
+from .error_points import ErrorPoints
+from .exposure import before_gain
 from .plan import Plan
 from .poses import CameraOptimizer
 
@@ -61,6 +63,7 @@ class TrainState:
         order: the random stream of the order of views.
         colors: the random stream of backgrounds.
         poses: the poses of the training cameras if the fit refines them, else None.
+        error_points: the points that are added where the error is; None without any, and after the last ones.
         step: the steps that are done.
         seconds: the time that they took, evaluations not counted.
         stack: views that are still to come before `order` shuffles all again.
@@ -76,6 +79,7 @@ class TrainState:
     order: torch.Generator
     colors: torch.Generator
     poses: CameraOptimizer | None
+    error_points: ErrorPoints | None = None
     step: int = 0
     seconds: float = 0.0
     stack: list[int] = field(default_factory=list)
@@ -86,9 +90,7 @@ class TrainState:
     def begin(cls, scene: Scene, plan: Plan, points: InitialPoints) -> Self:
         """The state before the first step, with Gaussians at the initial points."""
         nearest, median = typical_depths(points.points, scene.train.cameras)
-        colors = points.colors.float()
-        if scene.train.gains is not None and points.views is not None:
-            colors = (colors / scene.train.gains[points.views]).clamp(0, 1)
+        colors = before_gain(points.colors, scene.train.gains, points.views)
         model = GaussianModel.from_points(points.points.float(), colors, plan.config.sh_degree)
         model.sh_degree = 0
         start = Start(
@@ -97,7 +99,10 @@ class TrainState:
             near_plane=plan.config.recipe.near_plane * nearest,
             depth=median,
         )
-        return cls._assemble(scene, plan, model, start)
+        state = cls._assemble(scene, plan, model, start)
+        if points.reserve is not None and plan.schedule.error_points:
+            state.error_points = ErrorPoints.of(points.reserve, scene.train, 10 * plan.config.seed + 5, plan.device)
+        return state
 
     @classmethod
     def _assemble(cls, scene: Scene, plan: Plan, model: GaussianModel, start: Start) -> Self:
@@ -155,6 +160,7 @@ class TrainState:
             "order": self.order.get_state(),
             "colors": self.colors.get_state(),
             "poses": None if self.poses is None else self.poses.state_dict(),
+            "error_points": None if self.error_points is None else self.error_points.state_dict(),
             "init": self.start.init,
             "extent": self.start.extent,
             "near_plane": self.start.near_plane,
@@ -193,6 +199,8 @@ class TrainState:
                 )
             if state.poses is not None:
                 state.poses.load_state_dict(values["poses"])
+            if values["error_points"] is not None:
+                state.error_points = ErrorPoints(scene.train.cameras, plan.device, **values["error_points"])
         return state
 
 

@@ -34,6 +34,7 @@ from .checkpoint import errors_of, newest_checkpoint, previous, save_checkpoint
 from .config import FitConfig, Settings
 from .decisions import Decisions
 from .divergence import bound_scales, gradient_fault, parameter_fault, scale_fault, step_fault
+from .error_points import ErrorPoints
 from .exposure import with_exposure
 from .fit import Fit
 from .haze import FADE, veils
@@ -182,6 +183,8 @@ class Trainer:
         if state.step in schedule.densify:
             with self._backend.beside():
                 self._densify()
+        if state.step in schedule.error_points and state.error_points is not None:
+            self._add_where_the_error_is(state.error_points)
         if state.step in schedule.reset:
             state.densifier.reset_opacity(self.plan.config.recipe.reset_opacity)
         if state.step % _LOOK == 0:
@@ -299,11 +302,14 @@ class Trainer:
         rendering: Any = self.render_view(gaussians, camera, view.background_before_gain(background))
         if rendering.projected.means2d.requires_grad:
             rendering.projected.means2d.retain_grad()  # for the densifier
-        loss = self.loss_of(view.as_photographed(rendering.image), view)
+        image = view.as_photographed(rendering.image)
+        loss = self.loss_of(image, view)
         looks = state.step % self._look_every == 0 or state.step == steps or math.isnan(self._loss)
         if looks:
             self._loss = float(loss.detach())
             self._stop_if(step_fault(state.model, rendering.projected.num_nonfinite, self._loss))
+        if state.error_points is not None:
+            state.error_points.observe(index, image.detach(), view.image)
         if loss.requires_grad:
             loss.backward()
             if looks:
@@ -361,6 +367,14 @@ class Trainer:
         capped = state.densifier.step().capped
         if capped and maximum < 1.25 * first and maximum != self.plan.config.init_points:
             state.note(f"max_gaussians: {maximum} leaves little room beside the {first} initial points")
+
+    def _add_where_the_error_is(self, points: ErrorPoints) -> None:
+        state = self.state
+        count = len(state.model)
+        wanted = min(round(self.plan.config.recipe.error_points * count), self.plan.max_gaussians - count)
+        state.densifier.add(points.draw(wanted, state.model.max_sh_degree))
+        if state.step == self.plan.schedule.error_points[-1]:
+            state.error_points = None  # checkpoints are smaller without it
 
     def _stop_if(self, fault: str) -> None:
         if fault:

@@ -20,7 +20,7 @@ from kgs.geometry.cameras import project, to
 from kgs.geometry.multiview import inside_images, unproject
 
 from .agreement import interpolate
-from .dense import MIN_POINTS, dense_points
+from .dense import MIN_POINTS, Reserve, dense_points
 from .depth_limits import MIN_SIFT, certain_points, depth_range, sweep_range
 from .files import read_points
 from .patches import PatchColors
@@ -42,6 +42,7 @@ class InitialPoints(ShownByShapes):
         kind: where the points come from: "dense", "sift", "random", "file", or the scene's `init_kind`.
         patches: of "dense", the colours of the surface in the views that agree on it; else None.
         views: of "dense", the number of the view that each point's colour is from, `(P,)` int64; else None.
+        reserve: of "dense", the points that two views agree on, too, but that were not drawn; else None.
     """
 
     points: Tensor
@@ -49,6 +50,7 @@ class InitialPoints(ShownByShapes):
     kind: str
     patches: PatchColors | None = None
     views: Tensor | None = None
+    reserve: Reserve | None = None
 
 
 @cpu_by_default
@@ -119,7 +121,7 @@ def initial_points(
         near, far = sweep_range(tracked, cameras)
         dense = dense_points(views, near, far, count, generator, bar, backend, draw, pixels, where)
         if dense.agreed >= (MIN_DENSE if count is None else min(MIN_DENSE, count)):
-            return InitialPoints(dense.points, dense.colors, kind, dense.patches, dense.views)
+            return InitialPoints(dense.points, dense.colors, kind, dense.patches, dense.views, dense.reserve)
         message = (
             f"initial points: {len(views)} training views agree on {dense.agreed} points only; SIFT points instead"
         )

@@ -40,6 +40,14 @@ FEW_VIEWS = 3
 MAX_POINTS_FEW_VIEWS = 90_000  # of up to so few views; with more, such fits take 1.4 times as long
 
 
+class Reserve(NamedTuple):
+    """The points on which two views agree that were not drawn."""
+
+    points: Tensor  # (P, 3) float32
+    colors: Tensor  # (P, 3), RGB in [0, 1]
+    views: Tensor  # (P,), the view that each point and its colour are from
+
+
 class DensePoints(NamedTuple):
     """Points on which two views agree."""
 
@@ -48,6 +56,7 @@ class DensePoints(NamedTuple):
     agreed: int  # how many points were agreed on, without those of the sky
     patches: PatchColors  # the colours of all agreed patches
     views: Tensor  # (P,), the view that each colour is from
+    reserve: Reserve
 
 
 def dense_points(
@@ -89,7 +98,9 @@ def dense_points(
     chosen = chosen[_with_less_sky(is_sky[chosen])]
     of_view = [view_pixels[view == i, 1:] for i in range(len(views))]
     patches = patch_colors(views, cameras, maps, certain, of_view)
-    return DensePoints(points[chosen].float(), colors[chosen], int((~is_sky).sum()), patches, view[chosen])
+    is_left = torch.ones(len(points), dtype=torch.bool).index_fill(0, chosen, False)
+    reserve = Reserve(points[is_left].float(), colors[is_left], view[is_left])
+    return DensePoints(points[chosen].float(), colors[chosen], int((~is_sky).sum()), patches, view[chosen], reserve)
 
 
 def small_enough(views: Views, near: float, far: float) -> Views:
