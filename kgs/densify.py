@@ -231,16 +231,15 @@ class Densifier:
 
         Raises:
             TypeError: `gaussians` is not a GaussianModel.
-            ValueError: it has harmonics of another degree, or there would be more than `max_gaussians`.
+            ValueError: it has harmonics of another degree, or more Gaussians than `max_gaussians` leaves room for.
         """
         check_kind("gaussians", gaussians, GaussianModel)
         self._check()
         model = self.model
         if gaussians.max_sh_degree != model.max_sh_degree:
             raise ArgumentError("gaussians", f"harmonics of degree {model.max_sh_degree}", gaussians.max_sh_degree)
-        total = len(model) + len(gaussians)
-        if self.max_gaussians is not None and total > self.max_gaussians:
-            raise ArgumentError("gaussians", f"at most {self.max_gaussians} with those of the model", total)
+        if self.max_gaussians is not None and len(gaussians) > (room := max(0, self.max_gaussians - len(model))):
+            raise ArgumentError("gaussians", f"at most the {room} that max_gaussians leaves room for", len(gaussians))
         old_rows = torch.arange(len(model), device=model.means.device)
         for name, parameter in model.per_gaussian().items():
             added = gaussians.get_parameter(name).to(parameter)

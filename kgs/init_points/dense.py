@@ -6,6 +6,7 @@ stays that of the scene.
 """
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kgs._support.progress import ProgressBar, silent
+from kgs._support.shown import ShownByShapes
 from kgs.datasets.scene import Views
 from kgs.geometry.cameras import to
 from kgs.geometry.multiview import unproject
@@ -40,12 +42,19 @@ FEW_VIEWS = 3
 MAX_POINTS_FEW_VIEWS = 90_000  # of up to so few views; with more, such fits take 1.4 times as long
 
 
-class Reserve(NamedTuple):
-    """The points on which two views agree that were not drawn."""
+@dataclass(frozen=True, eq=False, repr=False)
+class Reserve(ShownByShapes):
+    """The points on which two views agree that were not drawn.
 
-    points: Tensor  # (P, 3) float32
-    colors: Tensor  # (P, 3), RGB in [0, 1]
-    views: Tensor  # (P,), the view that each point and its colour are from
+    Args:
+        points: in the frame of the views, `(P, 3)` float32 on the CPU.
+        colors: RGB in [0, 1], `(P, 3)` float32.
+        views: the number of the view that each point and its colour are from, `(P,)` int64.
+    """
+
+    points: Tensor
+    colors: Tensor
+    views: Tensor
 
 
 class DensePoints(NamedTuple):
