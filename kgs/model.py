@@ -117,6 +117,8 @@ class GaussianModel(nn.Module):
         _check_degree(sh_degree, MAX_SH_DEGREE)
         points = points.detach()
         n = len(points)
+        if scales is not None and scales.shape != (n,):
+            raise ArgumentError("scales", f"shape ({n},)", tuple(scales.shape))
         log_scales = log_spacing(points) if scales is None else scales.detach().log()
         return cls(
             means=points,

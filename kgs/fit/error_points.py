@@ -21,7 +21,7 @@ from kgs.model import GaussianModel
 
 from .exposure import before_gain
 
-SCALE = 0.5  # pixels: larger Gaussians blur what the photos show
+SCALE = 0.25  # of a photo's pixel, the standard deviation of a new Gaussian: larger ones blur
 
 
 class ErrorPoints:

@@ -173,6 +173,39 @@ def test_extreme_scales_and_opacities_stay_finite(log_scale):
     assert all(bool(torch.isfinite(parameter).all()) for parameter in model.parameters())
 
 
+# -- Gaussians from elsewhere --------------------------------------------------------------------------------------
+
+
+def test_added_gaussians_come_last_without_moments_and_the_others_stay_as_they_are():
+    model, adam, densifier = make([SMALL, LARGE])
+    train(model, adam)
+    densifier.observe(seen(model, [0, 1], [(3e-4, 4e-4), (1e-4, 0)]))
+    before = snapshot(model, adam)
+    gradients = densifier.mean_gradients
+    other = random_model(3, 2, seed=1)
+    densifier.add(other)
+    for name, parameter in model.named_parameters():
+        value, moments = before[name]
+        assert torch.equal(parameter, torch.cat([value, other.get_parameter(name)]))
+        for moment in ("exp_avg", "exp_avg_sq"):
+            assert torch.equal(adam.state[parameter][moment][:2], moments[moment])
+            assert not adam.state[parameter][moment][2:].any()
+    assert torch.equal(densifier.mean_gradients, torch.cat([gradients, torch.zeros(3)]))
+    assert densifier.step() == DensifyReport(cloned=1, split=0, pruned=0, total=6, capped=0)
+    train(model, adam)
+
+
+@pytest.mark.parametrize(("count", "degree"), [(2, 2), (1, 1)])
+def test_more_than_there_is_room_for_or_other_harmonics_are_refused_and_change_nothing(count, degree):
+    model, adam, densifier = make([SMALL] * 3, max_gaussians=4)
+    with refused(ArgumentError, name="gaussians"):
+        densifier.add(random_model(count, degree))
+    assert len(model) == 3
+    densifier.add(random_model(1, 2))
+    train(model, adam)
+    assert len(model) == 4
+
+
 # -- the mean gradients that scores are made of --------------------------------------------------------------------
 
 

@@ -64,6 +64,16 @@ def test_first_values_follow_the_recipe():
     assert torch.allclose(gaussians.opacities, torch.full((200,), 0.1))
 
 
+def test_scales_may_be_given_and_then_one_point_is_enough():
+    points, colors = cloud()
+    scales = torch.tensor([0.25])
+    made = GaussianModel.from_points(points[:1], colors[:1], 1, scales)
+    torch.testing.assert_close(made().scales, scales.expand(1, 3))
+    assert len(GaussianModel.from_points(points[:0], colors[:0], 1, scales[:0])) == 0
+    with refused(ArgumentError, name="scales"):
+        GaussianModel.from_points(points, colors, 1, scales)
+
+
 def test_a_state_dict_rebuilds_a_model_of_any_size():
     made = model(9, 2)
     made.sh_degree = 1

@@ -123,7 +123,7 @@ def test_errors_that_are_not_finite_are_not_drawn(error_points):
 # -- what is drawn ---------------------------------------------------------------------------------------------------
 
 
-def test_a_new_gaussian_covers_half_a_pixel_of_its_photo_at_its_depth(scene, error_points):
+def test_a_new_gaussian_has_a_quarter_of_a_pixel_of_its_photo_at_its_depth(scene, error_points):
     for view in range(3):
         observe(error_points, view, torch.ones(HEIGHT, WIDTH))
     model = error_points.draw(200, 2)
@@ -133,7 +133,7 @@ def test_a_new_gaussian_covers_half_a_pixel_of_its_photo_at_its_depth(scene, err
         pixels, depths = project(camera, torch.stack([mean, right]).detach())
         torch.testing.assert_close(pixels[0, 0], torch.tensor([x, y]).double(), rtol=0, atol=1e-3)
         assert float(depths[0, 0]) == pytest.approx(DEPTH, rel=1e-5)
-        assert float((pixels[1, 0] - pixels[0, 0]).norm()) == pytest.approx(0.5, rel=1e-3)
+        assert float((pixels[1, 0] - pixels[0, 0]).norm()) == pytest.approx(0.25, rel=1e-3)
         assert torch.equal(scales, scales[:1].expand(3))
     torch.testing.assert_close(model.opacity_logits.sigmoid(), torch.full((200,), 0.1))
     assert torch.equal(model.quats, torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(200, 4))

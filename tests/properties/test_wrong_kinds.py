@@ -53,6 +53,7 @@ WRONG = [
     ("gaussians", TypeError, lambda: reference.render(MODEL, scene().train.camera(0))),
     ("model", TypeError, lambda: save_glb("x.glb", MODEL(), UPRIGHT)),
     ("model", TypeError, lambda: Densifier(MODEL(), None, 1.0)),
+    ("gaussians", TypeError, lambda: Densifier(MODEL, torch.optim.Adam(MODEL.parameters()), 1.0).add(MODEL())),
     ("projected", TypeError, lambda: Densifier(MODEL, torch.optim.Adam(MODEL.parameters()), 1.0).observe(MODEL())),
     ("index", TypeError, lambda: MODEL()[0]),
     ("backgrounds", TypeError, lambda: rasterize(backgrounds=[[1, 1, 1]])),
