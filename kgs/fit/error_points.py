@@ -62,7 +62,7 @@ class ErrorPoints:
         self._is_left = is_left.to(device)
         self._generator = torch.Generator()
         self._generator.set_state(generator)
-        scales = torch.zeros(count)
+        scales = torch.zeros(count, dtype=torch.float32, device="cpu")
         self._rows = list[Tensor]()  # of each view's points
         self._pixels = list[Tensor]()  # of these, numbered row by row
         height, width = self._size
@@ -87,8 +87,8 @@ class ErrorPoints:
             points=reserve.points,
             colors=(255.0 * colors).round().to(torch.uint8),
             views=reserve.views.int(),
-            errors=torch.zeros(len(reserve.points)),
-            is_left=torch.ones(len(reserve.points), dtype=torch.bool),
+            errors=reserve.points.new_zeros(len(reserve.points)),
+            is_left=torch.ones_like(reserve.views, dtype=torch.bool),
             generator=torch.Generator().manual_seed(seed).get_state(),
         )
 

@@ -200,7 +200,9 @@ class TrainState:
             if state.poses is not None:
                 state.poses.load_state_dict(values["poses"])
             if values["error_points"] is not None:
-                state.error_points = ErrorPoints(scene.train.cameras, plan.device, **values["error_points"])
+                state.error_points = ErrorPoints(
+                    scene.train.cameras, plan.device, **copy.deepcopy(values["error_points"])
+                )
         return state
 
 

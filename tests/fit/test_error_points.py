@@ -230,6 +230,17 @@ def test_a_resumed_fit_has_the_bits_of_one_that_was_not_stopped(scene, dense, tm
     assert_same_bits(resumed, whole)
 
 
+def test_a_state_that_was_loaded_can_be_loaded_again(scene, dense):
+    trainer = begun(scene, dense, CONFIG)
+    trainer.fit(stop_at(10))
+    saved = trainer.state_dict()
+    others = begun(scene, dense, CONFIG), begun(scene, dense, CONFIG)
+    for other in others:
+        other.load_state_dict(saved)
+        other.fit()
+    assert_same_bits(*others)
+
+
 @pytest.mark.parametrize("name", ["colors", "views", "errors", "is_left"])
 def test_a_saved_state_with_rows_missing_is_refused(scene, dense, name):
     saved = begun(scene, dense, CONFIG).state_dict()
