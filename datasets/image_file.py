@@ -51,11 +51,8 @@ _RGB_OF_FULL_RANGE = (0, 1)
 _UNSPECIFIED = (2, 2)
 _SRGB_CHROMATICITIES = (0.3127, 0.3290, 0.64, 0.33, 0.30, 0.60, 0.15, 0.06)  # x and y of white, red, green and blue
 _SRGB_GAMMA = 1 / 2.2  # nearly, as libpng has it
-# Values of tags of TIFF and Exif
-_WHITE_IS_ZERO = 0  # of `Base.PhotometricInterpretation`
-_SEPARATE = 2  # of `Base.PlanarConfiguration`
-_ALPHA = 2  # of `Base.ExtraSamples`
-_OTHER_SAMPLES = {0: "a channel of no stated meaning", 1: "colours multiplied by alpha"}  # likewise
+_SEPARATE = 2  # of a TIFF's `Base.PlanarConfiguration`
+_STRAIGHT_ALPHA = 2  # of its `Base.ExtraSamples`
 _IS_SRGB, _IS_ADOBE_RGB, _UNCALIBRATED = 1, 2, 65535  # of `Base.ColorSpace`, the second of some cameras
 
 
@@ -201,8 +198,6 @@ def _read_header(path: Path, file: IO[bytes]) -> Metadata:
             tiff = image.tag_v2  # type: ignore[attr-defined]  # of TIFF only
             bits = max(tiff.get(Base.BitsPerSample, (1,)))
             tile = int(tiff.get(Base.TileWidth, 1)), int(tiff.get(Base.TileLength, 1))
-            if int(tags.get(Base.Orientation, 1)) in (5, 6, 7, 8):
-                size = size[::-1]  # Pillow gives that of the upright image
     except Exception as error:  # damaged bytes raise whatever Pillow's plugins happen to raise
         got = f"a {plugin.format} that is damaged, cut short or unusual"
         raise DataError(path, "", "an image", got, advice=cause_of(error)) from error
@@ -269,12 +264,16 @@ def _check_samples(image: Opened, bits: int) -> None:
         return
     tags = image.tag_v2  # type: ignore[attr-defined]  # of TIFF only
     samples = int(tags.get(Base.SamplesPerPixel, 1))
-    if samples > 1 and tags.get(Base.PlanarConfiguration) == _SEPARATE:
-        raise ValueError("channels in separate planes")
-    if samples in (2, 4) and (kind := tags.get(Base.ExtraSamples, (_ALPHA,))[0]) in _OTHER_SAMPLES:
-        raise ValueError(_OTHER_SAMPLES[kind])
-    if bits == 16 and tags.get(Base.PhotometricInterpretation) == _WHITE_IS_ZERO:
-        raise ValueError("16 bits in which white is 0")
+    alpha = tags.get(Base.ExtraSamples, (_STRAIGHT_ALPHA,))[0]
+    refused = {
+        "channels in separate planes": samples > 1 and tags.get(Base.PlanarConfiguration) == _SEPARATE,
+        "a last channel that is not straight alpha": samples in (2, 4) and alpha != _STRAIGHT_ALPHA,
+        "16 bits in which white is 0": bits == 16 and tags.get(Base.PhotometricInterpretation) == 0,
+        "a TIFF whose orientation turns it": tags.get(Base.Orientation, 1) != 1,
+    }
+    for what, is_so in refused.items():
+        if is_so:
+            raise ValueError(what)
 
 
 def _profile(image: Opened, cicp: bytes, tags: dict[int, Any]) -> Profile:
@@ -314,15 +313,9 @@ def _decode(image: Opened, data: bytes, header: Metadata) -> NDArray[np.uint8 | 
     if image.format == "PNG":
         type(image)(io.BytesIO(data)).verify()  # the check sums, which decoders pass over
     if header.bits == 16:
-        pixels = _decode_with_opencv(data)
-    else:
-        with warnings.catch_warnings(action="ignore"):  # Pillow warns of many pixels: the size was checked
-            pixels = np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB"))
-    if image.format != "TIFF":
-        return pixels
-    # Both decoders turned the image upright: turn it back. 6 and 8 undo each other, all others undo themselves.
-    orientation = int(header.tags.get(Base.Orientation, 1))
-    return np.ascontiguousarray(turn(pixels, {6: 8, 8: 6}.get(orientation, orientation)))
+        return _decode_with_opencv(data)
+    with warnings.catch_warnings(action="ignore"):  # Pillow warns of many pixels: the size was checked
+        return np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB"))
 
 
 def _decode_jpeg(image: Opened, data: bytes) -> NDArray[np.uint8]:
@@ -336,7 +329,7 @@ def _decode_jpeg(image: Opened, data: bytes) -> NDArray[np.uint8]:
 
 
 def _decode_with_opencv(data: bytes) -> NDArray[np.uint16]:
-    """RGB or RGBA of a PNG or TIFF of 16 bits, the latter upright."""
+    """RGB or RGBA of a PNG or TIFF of 16 bits."""
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the error says all in one line
     try:

@@ -121,16 +121,6 @@ def test_strips_are_found_that_are_reached_by_a_rounding():
         assert not alphas[~found].any()
 
 
-def test_a_strip_beside_the_ellipse_is_not_found():
-    rows = np.zeros((kernels.K, kernels.ROW), np.float32)
-    rows[:, 3] = rows[:, 6] = 1.0  # alpha is 2^-(dx^2 + dy^2)
-    rows[0, 2] = -3.5 + 1.99  # the last row of the first strip is less than a pixel above, the next less than 3 below
-    rows[1, 1], rows[1, 2] = 5.6, -3.5  # 2.1 beside the tile
-    rows[2, 1] = 5.4
-    found, _ = find_strips(rows, 3, 2.0**-4)
-    assert found.tolist() == [[True, True, False, False], [False] * 4, [False, True, True, False]]
-
-
 def test_strips_are_found_whatever_is_not_finite():
     for column, bad in itertools.product(range(7), (np.nan, np.inf, -np.inf, 3e38, -3e38)):
         rows = layers_of_a_chunk(0, kernels.K)

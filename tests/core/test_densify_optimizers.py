@@ -7,7 +7,6 @@ import pytest
 import torch
 from densifiers import LARGE, SMALL, seen, snapshot, train
 from densifiers import densifier as make
-from factories import other_defaults
 from refusals import refused
 
 from kgs import ArgumentError
@@ -196,19 +195,3 @@ def test_a_model_and_its_densifier_take_over_saved_states_of_another_size():
     for one, two in ((model, adam), resumed[:2]):
         train(one, two)
     assert all(torch.equal(a, b) for a, b in zip(model.parameters(), resumed[0].parameters(), strict=True))
-
-
-def test_default_device_and_default_dtype_do_not_reach_the_children():
-    def children():
-        model, _, densifier = make([LARGE] * 3)
-        densifier.observe(seen(model, [0, 1], [(1, 0), (1, 0)]))
-        return model, densifier
-
-    model, densifier = children()
-    densifier.step()
-    other, densifier = children()
-    with other_defaults():
-        densifier.step()
-        densifier.reset_opacity(0.9)
-        Densifier(other, torch.optim.Adam(other.parameters()), 1.0)
-    assert all(torch.equal(a, b) for a, b in zip(model.parameters(), other.parameters(), strict=True))

@@ -39,20 +39,6 @@ def test_the_list_is_everything_in_front_that_would_be_drawn_at_opacity_two():
     assert clear.sum() > 580
 
 
-def test_footprints_count_to_the_outer_edge_of_the_border_pixels():
-    reach = REACH * math.sqrt(0.3) + 0.5
-    pixels = []
-    for off in (-0.01, 0.01):
-        far = reach + off
-        pixels += [(-far, 20), (WIDTH - 1 + far, 20), (30, -far), (30, HEIGHT - 1 + far)]
-    camera = pinhole(HEIGHT, WIDTH, 1.0, (0.0, 0.0))
-    means = torch.cat([torch.tensor(pixels), torch.ones(8, 1)], 1).double()
-    quats, scales = torch.eye(4)[:1].expand(8, 4).double(), torch.full((8, 3), 1e-9).double()
-    got = project(Gaussians(means, quats, scales, torch.full((8,), 0.5).double(), means), camera)
-    assert got.gaussian_ids.tolist() == [0, 1, 2, 3]
-    assert got.radii.tolist() == [2.0] * 4
-
-
 def test_with_threshold_0_every_gaussian_in_front_is_listed():
     gaussians, cameras = wide_scene(), random_camera(HEIGHT, WIDTH, 0)
     depths = sigma_route(gaussians, cameras)[2]

@@ -22,18 +22,6 @@ def test_weights_and_transmittance_are_a_partition_of_unity():
     assert float((image - 0.7).abs().max()) < 1e-14
 
 
-def test_layers_give_depth_and_median_depth():
-    drawn = layers(stack([0.4, 0.3, 0.5], [RED] * 3), SMALL, **EXACT)
-    assert drawn.order.tolist() == [0, 1, 2]
-    assert drawn.depths.tolist() == [1, 2, 3]
-    alpha = 1 - drawn.transmittance
-    depth = torch.einsum("lhw,l->hw", drawn.weights, drawn.depths) / alpha
-    w = [0.4, 0.6 * 0.3, 0.6 * 0.7 * 0.5]
-    torch.testing.assert_close(depth, torch.full_like(depth, (w[0] + 2 * w[1] + 3 * w[2]) / sum(w)), atol=1e-8, rtol=0)
-    behind = 1 - drawn.weights.cumsum(0)
-    assert (drawn.depths[(behind < 0.5).int().argmax(0)] == 2).all()
-
-
 @pytest.mark.parametrize("form", [(3,), (1, 3), (1, 3, 4, 5)])
 def test_background_forms(form):
     color = tensor(0.2, 0.4, 0.6)

@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 from factories import FIELDS, pinhole, random_camera, random_gaussians, replace, with_camera
-from oracles import near_threshold
 from reference_checks import BLUE, EXACT, GREEN, RED, SMALL, fields, one, stack, tensor
 
 from kgs import Gaussians
@@ -84,14 +83,3 @@ def test_two_opaque_layers_do_not_let_the_background_shine_through(dtype):
     image = render(opaque, pinhole(4, 5, 10, dtype=dtype), torch.ones(3, dtype=dtype))
     assert image.dtype == torch.float64
     assert float((image[0, :, 0, 0] - tensor(0.99, 0.0099, 0.0)).abs().max()) < 2e-4
-
-
-def test_pixels_near_a_threshold_are_found():
-    wide = {"scale": 1e9}
-    assert near_threshold(stack([1 / 255 * (1 + 1e-6)], [RED], **wide), SMALL).all()
-    assert near_threshold(stack([0.99 * (1 - 1e-6)], [RED], **wide), SMALL).all()
-    assert near_threshold(stack([0.99, 0.99], [RED, RED], **wide), SMALL).all()
-    assert near_threshold(stack([0.5], [RED], **wide), SMALL, transmittance_stop=0.5).all()
-    assert not near_threshold(stack([0.5, 0.3, 0.98], [RED] * 3, **wide), SMALL).any()
-    ordinary = near_threshold(random_gaussians(100, 0), random_camera(24, 24, 0), rel=1e-2)
-    assert 0 < int(ordinary.sum()) < 400

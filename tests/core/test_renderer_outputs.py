@@ -56,19 +56,6 @@ def test_normals_have_gradients():
     assert torch.autograd.gradcheck(normal, small.quats.clone().requires_grad_(), fast_mode=True)
 
 
-@pytest.mark.parametrize("width", [1, 2, 5])
-def test_features_of_any_width_are_drawn_as_colours_are(width):
-    gaussians, camera = random_scene(0, torch.float64, 60, SIZE, None)
-    features = torch.randn(60, width, dtype=torch.float64)
-    background = torch.randn(width, dtype=torch.float64)
-    out = GaussianRenderer()(replace(gaussians, colors=features), camera, background, outputs=("image", "depth"))
-    assert out.image.shape == (1, width, *SIZE)
-    assert torch.equal(out.depth, GaussianRenderer()(gaussians, camera, outputs=("depth",)).depth)
-    for i in range(width):
-        one = replace(gaussians, colors=features[:, i : i + 1].expand(60, 3))
-        assert torch.allclose(out.image[:, i], GaussianRenderer()(one, camera, background[i].expand(3)).image[:, 0])
-
-
 @pytest.mark.parametrize("shape", [(3,), (1, 3), (3, *SIZE), (1, 3, *SIZE)])
 def test_an_infinite_background_shows_only_where_light_is_left(shape):
     wall = [one_gaussian((50.0, 50.0, 0.01), mean=(0.0, 0.0, z), opacity=0.99) for z in (3.0, 4.0, 5.0)]

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from tiny_scenes import read_image
 
-from kgs._support.errors import DataError
 from kgs.datasets.folders import image_folder, list_images
 from kgs.datasets.images import Intrinsics, rectification, remap, resize
 
@@ -43,18 +42,6 @@ def test_colours_come_as_rgb(tmp_path: Path) -> None:
     assert image.shape == (2, 3, 3)
     assert image.dtype == np.float32
     np.testing.assert_array_equal(image[0, 0], np.array([0, 0.2, 1], np.float32))
-
-
-@pytest.mark.parametrize("suffix", [".png", ".webp"])
-@pytest.mark.parametrize("kept", [0.0, 0.5, 0.98])
-def test_a_truncated_image_is_named(tmp_path: Path, suffix: str, kept: float) -> None:
-    noise = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)
-    path = tmp_path / f"cut{suffix}"
-    cv2.imwrite(str(path), noise)
-    assert read_image(path).shape == (40, 60, 3)
-    path.write_bytes(path.read_bytes()[: int(kept * path.stat().st_size)])
-    with pytest.raises(DataError, match=r"cut\."):
-        read_image(path)
 
 
 def test_folders(tmp_path: Path) -> None:

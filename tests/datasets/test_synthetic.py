@@ -4,14 +4,11 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from epipolar import sampson_distances
 from kornia.geometry.depth import warp_frame_depth
-from yard import yard_depths, yard_from_above, yard_scene
 
 from kgs.datasets.scene import Scene
-from kgs.datasets.synthetic import SUPERSAMPLING, room, synthetic_depths, synthetic_scene
+from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
 from kgs.datasets.synthetic.raycast import CHUNK, _project, raycast
-from kgs.datasets.synthetic.textures import field
 
 SMALL = (42, 56)
 
@@ -52,57 +49,6 @@ def test_same_seed_gives_the_same_bits_and_another_seed_another_scene():
     assert not torch.equal(synthetic_depths(cameras, 1), synthetic_depths(cameras, 0))
 
 
-@pytest.mark.slow
-def test_world_does_not_depend_on_the_number_of_views(scene):
-    few = synthetic_scene(train_views=1, test_views=0, size=(84, 112))
-    # the one camera and the middle one of three see one and the same world
-    warped, seen, error = _photo_error(scene.train, 1, few.train, 0)
-    assert seen.double().mean() > 0.5
-    assert error[seen].median() < 0.02
-    assert warped.shape == few.train.images[:1].shape
-
-
-def test_train_and_test_cameras_are_disjoint(scene):
-    centers = [_centers(views.cameras.extrinsics) for views in (scene.train, scene.test)]
-    assert torch.cdist(*centers).min() > 0.01
-    assert torch.pdist(torch.cat(centers)).min() > 0.01
-    assert not set(scene.train.names) & set(scene.test.names)
-
-
-@pytest.mark.parametrize(
-    ("seed", "size"),
-    [(0, (42, 56)), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((1, (56, 42)), (2, (48, 48))))],
-)
-def test_forward_views_are_covered_wholly(seed, size):
-    scene = synthetic_scene(train_views=3, test_views=6, size=size, seed=seed)
-    for views in (scene.train, scene.test):
-        depths = synthetic_depths(views.cameras, seed=seed)
-        assert (depths > 1.0).all()
-        assert (depths < room.WALL + 0.6).all()
-
-
-def test_the_yard_of_other_tests_has_a_sky_as_good_as_infinitely_far_away():
-    depths = yard_depths(yard_scene(3, 0, SMALL).train)
-    assert (depths > 1).all()  # a camera sees ground or sky everywhere
-    assert 0.3 < (depths > 100).double().mean() < 0.7
-    assert (yard_from_above(SMALL)[1] < 100).all()
-
-
-def _pairs_per_ray(made, size, extrinsics):
-    """Pairs of a triangle and a pixel in its box, of which a picture is made."""
-    matrix, rays = _pinhole(size[0] * SUPERSAMPLING, size[1] * SUPERSAMPLING)
-    return _project(made.triangles, matrix, extrinsics, rays).counts.sum() / rays[0] / rays[1]
-
-
-@pytest.mark.slow
-def test_the_work_is_bounded():
-    ahead = np.eye(4)
-    ahead[:3, 3] = -room.EYE
-    made = room.make_room(0)
-    assert len(made.triangles) < 20_000
-    assert _pairs_per_ray(made, (189, 252), ahead) < 12
-
-
 def test_views_show_parallax_and_parts_that_other_views_do_not_see(scene):
     """Near and far things move differently by many pixels between neighbours, and some of the scene is hidden."""
     depths = synthetic_depths(scene.train.cameras)
@@ -122,16 +68,6 @@ def test_views_agree_on_the_colour_of_the_surfaces_they_both_see(scene, source, 
     shifted = torch.roll(scene.train.images[target : target + 1], 1, dims=3)
     beside = (warped - shifted).abs().mean(dim=1, keepdim=True)
     assert error[seen].mean() < 0.6 * beside[seen].mean()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
-def test_sift_matches_neighbouring_views_along_the_epipolar_lines(seed):
-    train, _ = yard_from_above((189, 252), seed)
-    for i in range(2):
-        distances = sampson_distances(train, i, i + 1, ratio=0.75)
-        assert (distances < 0.7).sum() >= 150
-        assert (distances < 0.7).double().mean() > 0.9
 
 
 def test_raycast_closed_mesh_has_no_cracks_and_hides_what_is_behind():
@@ -169,14 +105,6 @@ def test_raycast_is_the_solution_of_each_pair_of_a_ray_and_a_triangle():
     last = len(triangles) - 1 - np.argmin(distances[::-1], axis=0)
     np.testing.assert_array_equal(faces, np.where(np.isinf(nearest), -1, last))
     assert (faces >= 86).sum() > 100
-
-
-def test_a_texture_is_a_function_of_the_point_alone():
-    points = np.random.default_rng(1).normal(size=(600, 3)).astype(np.float32)
-    texture = field(np.random.default_rng(0), 0.1, 0.5)
-    whole = texture(points)
-    for start, stop in ((0, 1), (3, 500), (255, 257), (597, 600)):
-        np.testing.assert_array_equal(texture(points[start:stop]), whole[start:stop])
 
 
 def _photo_error(source, i, target, j):

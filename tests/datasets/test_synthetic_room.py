@@ -6,8 +6,8 @@ import torch
 import trimesh
 from kornia.geometry.depth import depth_to_3d_v2
 
-from kgs.datasets.synthetic import room, synthetic_depths, synthetic_scene, world
-from kgs.datasets.synthetic.furniture import Part, plain, printed
+from kgs.datasets.synthetic import room, synthetic_depths, synthetic_scene
+from kgs.datasets.synthetic.furniture import printed
 from kgs.datasets.synthetic.light import daylight, received
 from kgs.datasets.synthetic.pictures import blank
 from kgs.datasets.synthetic.raycast import raycast
@@ -28,18 +28,6 @@ def scene():
 @pytest.fixture(scope="module")
 def depths(scene):
     return synthetic_depths(scene.train.cameras)
-
-
-@pytest.mark.slow
-def test_photos_are_neither_dark_nor_burnt_out(scene):
-    assert scene.train.images.shape == (3, 3, *SIZE)
-    assert scene.test.images.shape == (5, 3, *SIZE)
-    for images in (scene.train.images, scene.test.images):
-        assert images.min() >= 0.0
-        assert images.max() <= 1.0
-        assert (images == 1.0).float().mean() < 0.05
-        assert 0.35 < images.mean() < 0.7
-        assert images.std() > 0.15
 
 
 def test_test_cameras_lie_between_the_training_cameras_and_outside(scene):
@@ -65,38 +53,6 @@ def test_depths_of_the_wall_and_the_table_are_those_of_their_planes(scene, depth
         assert on_table.double().mean() > 0.03
         assert (points[..., 2] < room.WALL + 1e-6).all()
         assert (points[..., 1] < 1e-6).all()  # nothing is under the floor
-
-
-def test_a_point_has_its_colour_where_the_camera_projects_it(made, scene, depths):
-    """Points spread over all triangles, projected by Kornia's camera, in each photo that sees them."""
-    mesh = trimesh.Trimesh(made.triangles.reshape(-1, 3), np.arange(3 * len(made.triangles)).reshape(-1, 3))
-    weights = mesh.area_faces * (np.linalg.norm(mesh.triangles_center - room.CENTER, axis=1) < 1.5)
-    points, faces = trimesh.sample.sample_surface(mesh, 4000, face_weight=weights, seed=0)
-    colors, points = torch.from_numpy(made.shade(points, faces)), torch.from_numpy(points).float()
-    for i in range(3):
-        camera = scene.train.camera(i)
-        z = (points @ camera.rotation_matrix[0].T + camera.translation_vector[0, :, 0])[:, 2]
-        u, v = camera.project(points).round().long().T
-        visible = (u >= 0) & (v >= 0) & (u < SIZE[1] - 3) & (v < SIZE[0])
-        visible &= (depths[i, 0][v.clamp(0, SIZE[0] - 1), u.clamp(0, SIZE[1] - 1)] - z).abs() < 0.01
-        photo = scene.train.images[i]
-        there, beside = (photo[:, v[visible], x[visible]].T - colors[visible] for x in (u, u + 3))
-        assert visible.sum() > 800
-        assert there.abs().mean(dim=1).median() < 0.015
-        assert there.abs().mean() < 0.6 * beside.abs().mean()  # the same three pixels beside the truth
-
-
-def test_normals_are_smooth_over_a_ball_and_sharp_at_an_edge():
-    ball, brick = trimesh.creation.icosphere(subdivisions=3), trimesh.creation.box((1.0, 2.0, 3.0))
-    np.testing.assert_allclose(world._normals(ball), ball.triangles, atol=0.02)
-    np.testing.assert_allclose(world._normals(brick), np.repeat(brick.face_normals[:, None], 3, axis=1), atol=1e-12)
-    rng = np.random.default_rng(0)
-    faces = rng.integers(len(ball.faces), size=200)
-    part = Part(ball, plain((255, 255, 255)))
-    made = world.make_world([], world.put([part], 0.0, 0.0), room.SUN, room.SKY)
-    points = np.einsum("nk,nkd->nd", rng.dirichlet([1, 1, 1], size=200), made.triangles[faces])
-    mixed = made._normals_at(points, faces)
-    np.testing.assert_allclose(mixed, points / np.linalg.norm(points, axis=1, keepdims=True), atol=0.02)
 
 
 def test_light_is_lamberts_and_a_screen_shades_what_is_behind_it():

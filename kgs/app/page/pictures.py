@@ -51,7 +51,8 @@ def encoded(pictures: Sequence[Picture], max_bytes: int) -> list[dict[str, Any]]
     rows = list[dict[str, Any]]()
     for side in _LONGER_SIDES:
         rows = [_encoded(picture, side) for picture in pictures]
-        if sum(map(_size, rows)) <= max_bytes:
+        uris = [row["photo"] for row in rows] + [uri for row in rows for _, *both in row["renders"] for uri in both]
+        if sum(map(len, uris)) <= max_bytes:
             break
     return rows
 
@@ -74,18 +75,14 @@ def thumbnails(photos: Sequence[Tensor], max_bytes: int) -> list[dict[str, Any]]
     """
     rows = list[dict[str, Any]]()
     for height, quality in _THUMBNAIL_SIZES:
-        rows = [_thumbnail(photo.detach().cpu().float(), height, quality) for photo in photos]
+        rows = []
+        for photo in photos:
+            shrink = min(1.0, height / photo.shape[-2])
+            size = {"width": max(1, round(photo.shape[-1] * shrink)), "height": max(1, round(photo.shape[-2] * shrink))}
+            rows.append({"photo": _data_uri(photo, max(size.values()), quality), **size})
         if sum(len(row["photo"]) for row in rows) <= max_bytes:
             break
     return rows
-
-
-def _thumbnail(photo: Tensor, height: int, quality: int) -> dict[str, Any]:
-    rows, columns = photo.shape[-2:]
-    shrink = min(1.0, height / rows)
-    width = max(1, round(columns * shrink))
-    height = max(1, round(rows * shrink))
-    return {"photo": _data_uri(photo, max(width, height), quality), "width": width, "height": height}
 
 
 def _encoded(picture: Picture, side: int) -> dict[str, Any]:
@@ -101,12 +98,6 @@ def _encoded(picture: Picture, side: int) -> dict[str, Any]:
         "photo": _data_uri(photo, side),
         "renders": renders,
     }
-
-
-def _size(row: dict[str, Any]) -> int:
-    """Bytes of all data URIs of a picture."""
-    renders = sum(len(render) + len(difference) for _, render, difference in row["renders"])
-    return len(row["photo"]) + renders
 
 
 def _data_uri(image: Tensor, side: int, quality: int = _JPEG_QUALITY) -> str:

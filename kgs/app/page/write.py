@@ -3,7 +3,8 @@
 import base64
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -71,9 +72,6 @@ class _Page:
 
     Its policy (CSP) names the one script and the one style sheet by their SHA-256. The browser runs and applies no
     other, should a text of the user ever get into the page as code; so elements have no style attributes.
-
-    Args:
-        content: what the page shows.
     """
 
     def __init__(self, content: PageContent) -> None:
@@ -92,8 +90,14 @@ class _Page:
         self._scene = scene | {"offset": [0.0, 0.0, 0.0] if offset is None else offset.tolist()}
         self._settings = _viewer_settings(content.splat, content.photos)
         self._context = _context(content, self._scene)
+        width, height = scene["cameras"][scene["first"]]["size"]
+        sizes = [f":root {{ --aspect: {width} / {height} }}\n"]
+        for one in self._context["strip"]:
+            if "photo" in one:
+                size = f"--width: {one['width']}; --height: {one['height']}"
+                sizes.append(f'[data-camera="{one["index"]}"] {{ {size} }}\n')
         code = {
-            "style": "".join([*map(_file, _STYLES), *_sizes(self._scene, self._context["strip"])]),
+            "style": "".join([*map(_file, _STYLES), *sizes]),
             "script": "".join(map(_file, _SCRIPTS)),
         }
         for kind, text in code.items():
@@ -135,11 +139,13 @@ def _context(content: PageContent, scene: Mapping[str, Any]) -> dict[str, Any]:
     photos = content.photos
     text = content.text
     cameras = scene["cameras"]
+    count = len(cameras)
+    number = _NUMBERS[count - 1] if count <= len(_NUMBERS) else str(count)
     first_run = next(iter(text.runs.values()), {})
     measures_head, measures = measure_table(text.runs)
     return {
         "title": text.title,
-        "lead": f"{_in_words(len(cameras))}. Drag to look around.",
+        "lead": f"{number} photo{'s' if count > 1 else ''}. Drag to look around.",
         "strip": _strip(photos, cameras),
         "has_photos": bool(photos.pictures or photos.thumbnails),
         "version": __version__,
@@ -165,15 +171,6 @@ def _context(content: PageContent, scene: Mapping[str, Any]) -> dict[str, Any]:
 def _file(name: str) -> str:
     """The text of a file of this folder."""
     return resources.files("kgs.app.page").joinpath(name).read_text(encoding="utf-8")
-
-
-def _sizes(scene: Mapping[str, Any], strip: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Rules for the aspect ratio of the stage, that of the first view, and for the sizes of the thumbnails."""
-    width, height = scene["cameras"][scene["first"]]["size"]
-    yield f":root {{ --aspect: {width} / {height} }}\n"
-    for one in strip:
-        if "photo" in one:
-            yield f'[data-camera="{one["index"]}"] {{ --width: {one["width"]}; --height: {one["height"]} }}\n'
 
 
 def _strip(photos: PagePhotos, cameras: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -210,20 +207,6 @@ def _viewer_settings(splat: PageSplat, photos: PagePhotos) -> dict[str, Any]:
     }
 
 
-def _in_words(count: int) -> str:
-    """As "Six photos"."""
-    number = _NUMBERS[count - 1] if count <= len(_NUMBERS) else str(count)
-    return f"{number} photo{'s' if count > 1 else ''}"
-
-
-def _counts(parts: Sequence[str]) -> str:
-    """As "3 training and 2 test", or the number alone if all photos are of one kind."""
-    words = list(dict.fromkeys(parts))
-    if len(words) == 1:
-        return str(len(parts))
-    return " and ".join(f"{list(parts).count(word)} {word}" for word in words)
-
-
 def _camera_facts(cameras: Sequence[Mapping[str, Any]], parts: Sequence[str]) -> dict[str, str]:
     """The number of cameras, the size of their photos and their focal lengths, as text."""
     focal = sorted(camera["focal"][0] for camera in cameras)
@@ -232,8 +215,10 @@ def _camera_facts(cameras: Sequence[Mapping[str, Any]], parts: Sequence[str]) ->
     share = focal[len(focal) // 2] / max(width, height)
     in_order = sorted(cameras, key=lambda camera: camera["name"])
     files = [f"{camera['label']}: {camera['name']}" for camera in in_order] if len(cameras) <= _LISTED else []
+    counts = Counter(parts)
+    each = [f"{count} {word}" for word, count in counts.items()]
     return {
-        "cameras": _counts(parts),
+        "cameras": " and ".join(each) if len(counts) > 1 else str(len(parts)),
         "photo size": f"{width} × {height} pixels",
         "focal length": f"{span} pixels, {share:.2f} of the longer side",
         **({"files": "; ".join(files)} if files else {}),
