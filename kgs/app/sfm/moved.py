@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 MIN_OWN = 50  # points that each group sees and the other does not
-_SMALL = 0.4  # largest share of a photo's cells with points, in which it sees points that join
+_SMALL = 0.35  # largest share of a photo's cells with points, in which it sees points that join
 _FLAT = 0.06  # largest thickness of the points that join, over their extent
 _CELLS = 8  # of a photo, along each side
 _KEPT = 0.95  # of the points decide where the plane is, and how thick they are
