@@ -1,4 +1,4 @@
-"""What a type checker must find in an installed kgs: `mypy --strict` of this file, from outside the clone, is silent."""
+"""What a type checker must find in kgs: `mypy --strict` of this file, from outside the clone, is silent."""
 
 from typing import assert_type
 
