@@ -126,17 +126,15 @@ class ImageFile:
         self._data = None
         return to_srgb(np.asarray(pixels / np.float32(2 ** max(8, metadata.bits) - 1), np.float32), metadata.profile)
 
-    @property
-    def is_doubtful(self) -> bool:
-        """Whether its colours are taken for sRGB although its file may mean others."""
-        header = self.metadata
-        is_unnamed = not header.profile and header.tags.get(Base.ColorSpace) == _UNCALIBRATED
-        return is_unnamed or not is_usable(header.profile)
-
 
 def color_notes(images: Sequence[ImageFile]) -> list[str]:
     """A sentence that names photos whose colours may be others than sRGB; or []."""
-    names = [image.path.name for image in images if image.is_doubtful]
+    names = []
+    for image in images:
+        header = image.metadata
+        is_unnamed = not header.profile and header.tags.get(Base.ColorSpace) == _UNCALIBRATED
+        if is_unnamed or not is_usable(header.profile):
+            names.append(image.path.name)
     said = "colours are taken for sRGB, since the colour profile is missing, damaged or of another kind"
     return [f"{said}: {listed(names, _LISTED)}"] if names else []
 
@@ -198,6 +196,8 @@ def _read_header(path: Path, file: IO[bytes]) -> Metadata:
             tiff = image.tag_v2  # type: ignore[attr-defined]  # of TIFF only
             bits = max(tiff.get(Base.BitsPerSample, (1,)))
             tile = int(tiff.get(Base.TileWidth, 1)), int(tiff.get(Base.TileLength, 1))
+            if int(tags.get(Base.Orientation, 1)) in (5, 6, 7, 8):
+                size = size[::-1]  # Pillow gives that of the upright image
     except Exception as error:  # damaged bytes raise whatever Pillow's plugins happen to raise
         got = f"a {plugin.format} that is damaged, cut short or unusual"
         raise DataError(path, "", "an image", got, advice=cause_of(error)) from error
@@ -269,7 +269,6 @@ def _check_samples(image: Opened, bits: int) -> None:
         "channels in separate planes": samples > 1 and tags.get(Base.PlanarConfiguration) == _SEPARATE,
         "a last channel that is not straight alpha": samples in (2, 4) and alpha != _STRAIGHT_ALPHA,
         "16 bits in which white is 0": bits == 16 and tags.get(Base.PhotometricInterpretation) == 0,
-        "a TIFF whose orientation turns it": tags.get(Base.Orientation, 1) != 1,
     }
     for what, is_so in refused.items():
         if is_so:
@@ -313,9 +312,15 @@ def _decode(image: Opened, data: bytes, header: Metadata) -> NDArray[np.uint8 | 
     if image.format == "PNG":
         type(image)(io.BytesIO(data)).verify()  # the check sums, which decoders pass over
     if header.bits == 16:
-        return _decode_with_opencv(data)
-    with warnings.catch_warnings(action="ignore"):  # Pillow warns of many pixels: the size was checked
-        return np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB"))
+        pixels = _decode_with_opencv(data)
+    else:
+        with warnings.catch_warnings(action="ignore"):  # Pillow warns of many pixels: the size was checked
+            pixels = np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB"))
+    if image.format != "TIFF":
+        return pixels
+    # Both decoders turned the image upright: turn it back. 6 and 8 undo each other, all others undo themselves.
+    orientation = int(header.tags.get(Base.Orientation, 1))
+    return np.ascontiguousarray(turn(pixels, {6: 8, 8: 6}.get(orientation, orientation)))
 
 
 def _decode_jpeg(image: Opened, data: bytes) -> NDArray[np.uint8]:
@@ -329,7 +334,7 @@ def _decode_jpeg(image: Opened, data: bytes) -> NDArray[np.uint8]:
 
 
 def _decode_with_opencv(data: bytes) -> NDArray[np.uint16]:
-    """RGB or RGBA of a PNG or TIFF of 16 bits."""
+    """RGB or RGBA of a PNG or TIFF of 16 bits, the latter upright."""
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the error says all in one line
     try:

@@ -124,7 +124,8 @@ def load_scene(
             expected = f"cameras in one place, or at least {SMALLEST:g} apart"
             raise DataError(root, "poses", expected, f"{spread:.2g}", advice="scale poses and points up")
         offset = centers.mean(dim=0)  # float64; without the test views
-        first = _usual(train)
+        lying = [frame.intrinsics.width >= frame.intrinsics.height for frame in train]
+        first = train[lying.index(2 * sum(lying) >= len(lying))]  # of the kind, upright or lying, that most are
         scales = [_Scale.of(first, downscale or 1.0)]
         height, width = scales[0].size
         fine_downscale = max(1.0, (downscale or 1.0) * math.sqrt(height * width / _FINE_PIXELS))
@@ -209,12 +210,6 @@ def _split(
     return [frames[i] for i in chosen], test_frames
 
 
-def _usual(frames: Sequence[Frame]) -> Frame:
-    """The first frame of the kind, upright or lying, that most frames are."""
-    lying = [frame.intrinsics.width >= frame.intrinsics.height for frame in frames]
-    return frames[lying.index(2 * sum(lying) >= len(lying))]
-
-
 @dataclass(frozen=True)
 class _Scale:
     """By how much all photos are reduced, and the size that results."""
@@ -249,12 +244,6 @@ def _check_size(frame: Frame, width: int, height: int, scales: Sequence[_Scale])
         size = _reduced(width, height, scale.factor)
         if scale.size not in (size, size[::-1]):
             raise DataError(frame.path, "", f"{scale.first} pixels as the other images", f"{width}x{height}")
-
-
-def _is_turned(width: int, height: int, scale: _Scale) -> bool:
-    """Whether a photo has to be turned by a quarter to have the size of a scale."""
-    size = _reduced(width, height, scale.factor)
-    return size != scale.size and size == scale.size[::-1]
 
 
 def _views(
@@ -299,7 +288,7 @@ def _views(
                 image[..., :3] = image[..., :3] * alpha + background.numpy() * (1 - alpha)
             image = remap(image, maps, kept)
             kept = None if kept is None else remap(kept, maps)
-        turned[i] = _is_turned(width, height, scales[0])
+        turned[i] = _reduced(width, height, scales[0].factor) != scales[0].size  # it is that size on its side
         if turned[i]:
             lens = lens.turned()
             image = None if image is None else np.ascontiguousarray(np.rot90(image, -1))

@@ -41,7 +41,6 @@ def test_a_fit_loses_no_more_than_it_may_and_its_rows_stay_as_they_are(fitted, t
     kept = rows_of(tmp_path / "clean.ply")
     assert len(kept) <= len(whole)
     assert set(kept) <= set(whole)
-    assert run("clean", fitted, "-o", tmp_path / "clean.ply", "--strength", 0.5) == 0  # in place of the former
 
 
 def test_a_file_keeps_its_degree_and_its_tag(fitted, folder, tmp_path, capsys):

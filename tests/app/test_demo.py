@@ -139,20 +139,13 @@ def test_a_page_measures_at_the_size_of_the_fit_unless_told_otherwise(demo, tmp_
         assert (float(level) == pytest.approx(mean, abs=0.02)) == (not options)
 
 
-def test_sizes_that_cannot_be_fitted_and_photos_of_others_are_refused(demo, folder, tmp_path, capsys):
-    for scene in ("bananas", "room"):
-        assert run("demo", "--scene", scene, "--size", 31, "-o", tmp_path / "out") == 2
-        assert "--size: expected at least 32 pixels, got 31" in one_line(capsys)
-    (tmp_path / "images").mkdir()
-    (tmp_path / "images" / "mine.jpg").touch()
-    assert run("demo", "-o", tmp_path) == 3
-    assert "expected a new or empty folder, or one of kgs, got one with images" in one_line(capsys)
+def test_a_fit_to_a_scene_does_not_go_beside_the_photos_of_another(demo, folder, capsys):
     assert run("fit", folder, "-o", demo) == 3
     assert "expected a folder for fit, got one of kgs with photos" in one_line(capsys)
-    assert [path.name for path in tmp_path.iterdir()] == ["images"]
 
 
-def test_the_room_is_a_scene_without_photos_of_others(tmp_path, capsys):
+def test_the_room_is_a_scene_without_photos_of_others(tmp_path, capsys, points, monkeypatch):
+    monkeypatch.setattr("kgs.fit.run.choose_points", lambda *_: points)
     for resume in ((), ("--resume",)):
         assert run("demo", "-o", tmp_path, "--scene", "room", "--steps", 2, *TINY, *resume) == 0
         said = capsys.readouterr().out

@@ -11,7 +11,7 @@ from command import one_line, run
 from refusals import refused
 
 from kgs import DataError, backends
-from kgs._support.json_files import read_json, write_json
+from kgs._support.json_files import write_json
 from kgs.app.cli import tools
 from kgs.app.cli.run import COMMANDS, load_command
 from kgs.app.files.fit_files import CHECKPOINT, UNFINISHED
@@ -98,15 +98,6 @@ def test_auto_is_the_default_of_all_commands():
     assert defaults.pop("check") is None  # the CPU and all GPUs
     assert {*defaults} >= {"demo", "render", "eval", "page", "clean", "bench speed"}
     assert {*defaults.values()} == {"auto"}
-
-
-def test_a_fit_names_its_device_and_keeps_it(folder, tmp_path, capsys):
-    out = tmp_path / "out"
-    threads = torch.get_num_threads()
-    assert run("fit", folder, "-o", out, "--steps", 2, *QUICK) == 0
-    cores = f"{threads} core" if threads == 1 else f"{threads} cores"
-    assert capsys.readouterr().out.startswith(f"device: CPU, {cores}\n")
-    assert read_json(out / "config.json")["fit"]["device"] == "cpu"
 
 
 @pytest.mark.parametrize(("begun", "taken"), [("cpu", "cpu"), ("cpu:0", "cpu"), ("cuda", "cuda"), (None, "cuda")])

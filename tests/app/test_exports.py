@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from command import run
 from compressed_reader import decode, header
 from factories import random_model, random_views
 from kornia.geometry.camera import PinholeCamera
@@ -21,9 +22,9 @@ from kgs._support.json_files import write_json
 from kgs.app.cli.render import render
 from kgs.app.files import exports
 from kgs.app.files.cameras import camera_list, upright
+from kgs.app.files.film import path_near_plane
 from kgs.app.files.fit_files import EXPORTS
 from kgs.app.files.preview import write_preview
-from kgs.app.files.results import Results
 from kgs.datasets import Scene
 from kgs.fit import Fit
 from kgs.geometry.multiview import typical_depths
@@ -127,23 +128,6 @@ def test_the_film_that_cannot_be_is_a_note(fit: Fit, tmp_path: Path, monkeypatch
     assert exports.write_exports(fit, tmp_path) == ["no turntable.webm: a reason"]
 
 
-def test_one_film_takes_the_place_of_the_other(fit: Fit, tmp_path: Path, monkeypatch: Any) -> None:
-    pytest.importorskip("av")
-
-    def publish() -> list[str]:
-        with Results.open(tmp_path / "out", "fit") as results, results.stage() as new:
-            exports.write_exports(fit, new)
-        return sorted(path.name for path in (tmp_path / "out").glob("turntable.*"))
-
-    with monkeypatch.context() as patch:
-        patch.setitem(sys.modules, "av", None)
-        assert publish() == ["turntable.webm"]
-    assert publish() == ["turntable.mp4"]
-    (tmp_path / "out" / "turntable.webm").write_bytes(b"mine")
-    assert publish() == ["turntable.mp4", "turntable.webm"]
-    assert (tmp_path / "out" / "turntable.webm").read_bytes() == b"mine"
-
-
 @pytest.mark.parametrize("background", ["black", "white"])
 def test_a_png_with_alpha_over_a_background_is_the_opaque_one(folder: Path, tmp_path: Path, background: Any) -> None:
     points = torch.rand(300, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor([-0.5, -1.25, -0.5])
@@ -180,6 +164,7 @@ def test_the_film_leaves_out_what_is_right_before_its_camera(fit: Fit, tmp_path:
         ]
     assert (images[0] - images[1]).abs().max() > 0.01
     torch.testing.assert_close(renders[0](camera), images[1])
+    assert path_near_plane(fit.model.means, fit.scene.train.cameras, 1e3) == 1e3  # never nearer than that of the fit
 
 
 @pytest.mark.parametrize("size", [(30, 60), (60, 30)])
@@ -200,3 +185,23 @@ def test_the_still_is_the_middle_of_a_photo(tmp_path: Path, size: tuple[int, int
     x, y = views.camera(index).project(torch.tensor([[[0.3, -0.2, 4.0]]]))[0, 0].tolist()
     expected = (x - (width - 1) / 2) * scale + 1199 / 2, (y - (height - 1) / 2) * scale + 629 / 2
     assert camera.project(torch.tensor([[[0.3, -0.2, 4.0]]]))[0, 0].tolist() == pytest.approx(expected, abs=1e-2)
+
+
+def test_kgs_export_says_how_many_bytes_are_left(tmp_path: Path, capsys: Any) -> None:
+    splat = tmp_path / "splat.ply"
+    kgs.save_ply(splat, random_model(300, 1))
+    out = tmp_path / "small.compressed.ply"
+    for _ in range(2):  # its own file may be replaced
+        assert run("export", splat, "-o", out) == 0
+    said = capsys.readouterr().out
+    assert f"{out}: 300 Gaussians, 0.01 MB of 0.03" in said
+    kgs.save_compressed_ply(tmp_path / "same.ply", kgs.load_ply(splat))
+    assert out.read_bytes() == (tmp_path / "same.ply").read_bytes()
+
+
+def test_an_origin_of_kgs_export_makes_map_coordinates_small(tmp_path: Path) -> None:
+    model = random_model(20, 0)
+    kgs.save_ply(tmp_path / "map.ply", model, torch.tensor([5e6, 6e6, 100.0]).double())
+    out = tmp_path / "map.compressed.ply"
+    assert run("export", tmp_path / "map.ply", "-o", out, "--origin", 5000000, 6000000, 100) == 0
+    np.testing.assert_allclose(decode(out)["means"], model.means.detach().numpy(), atol=0.01)

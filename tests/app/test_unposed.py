@@ -10,7 +10,6 @@ from command import one_line, run
 from kornia.geometry.conversions import rotation_matrix_to_quaternion
 
 from kgs._support.errors import DataError
-from kgs._support.json_files import write_json
 from kgs.app import sfm
 from kgs.app.details import COARSE, DETAILS
 from kgs.app.files.outputs import write_png
@@ -43,42 +42,31 @@ def folder(truth, tmp_path):
 
 @pytest.fixture(autouse=True)
 def asked(truth, monkeypatch):
-    """True cameras instead of found ones; the folders that were asked for."""
+    """True cameras instead of found ones; the names of the photos that were asked for."""
     calls = []
 
-    def write_cameras(photos, out):
-        calls.append(sorted(path.name for path in photos))
-        model = out / "sparse" / "0"
-        model.mkdir(parents=True, exist_ok=True)
-        (out / "images").mkdir(exist_ok=True)
-        for name in calls[-1]:
-            shutil.copyfile(photos[0].parent / name, out / "images" / name)
+    def true_cameras(opened, new, *_):
+        names = [photo.name for photo in opened]
+        calls.append(names)
+        model = new / "sparse" / "0"
+        model.mkdir(parents=True)
+        (new / "images").mkdir()
+        for photo in opened:
+            shutil.copy(photo.path, new / "images")
         (height, width), matrix = SIZE, truth.cameras.intrinsics[0]
         lens = matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5
         (model / "cameras.txt").write_text(f"1 PINHOLE {width} {height} {' '.join(str(float(x)) for x in lens)}\n")
         (model / "points3D.txt").write_text("")
         lines = []
-        for name in calls[-1]:
+        for name in names:
             pose = truth.cameras.extrinsics[int(name[4:-4])].double()
             numbers = [*rotation_matrix_to_quaternion(pose[:3, :3]).tolist(), *pose[:3, 3].tolist()]
             lines += [f"{name[4:-4]} {' '.join(map(str, numbers))} 1 {name}", ""]
         (model / "images.txt").write_text("\n".join(lines) + "\n")
-        report = {
-            "photos": {name: {"image": name} for name in calls[-1]},
-            "size": [width, height],
-            "photo_size": [2 * width, 2 * height],
-        }
-        write_json(out / "photos.json", report | {"versions": {"kgs": "0"}})
-        return report
+        sizes = {"size": [width, height], "photo_size": [2 * width, 2 * height]}
+        return {"photos": {name: {"image": name} for name in names}, **sizes, "versions": {"kgs": "0"}}
 
-    def true_cameras(source, results, for_fit=False, **_):
-        if for_fit:
-            results.begin()
-            return write_cameras(source.photos, results.work) | {"folder": str(results.work)}
-        with results.stage() as new:
-            return write_cameras(source.photos, new) | {"folder": str(results.out)}
-
-    monkeypatch.setattr("kgs.app.sfm.pose.pose", true_cameras)
+    monkeypatch.setattr("kgs.app.sfm.pose.find_cameras", true_cameras)
     return calls
 
 

@@ -20,7 +20,7 @@ from kgs._support.compiled.lanes import WIDTH, load, store  # noqa: E402  # need
 from kgs.backends.cpu import binning_kernels, loss_kernels, projection_kernels  # noqa: E402  # needs numba
 from kgs.backends.cpu import compositing_kernels as kernels  # noqa: E402  # needs numba
 from kgs.backends.cpu.binning import TileCoverage  # noqa: E402  # needs numba
-from kgs.init_points import matching_kernels  # noqa: E402  # needs numba
+from kgs.init_points import matching_kernels, sweep_kernels  # noqa: E402  # needs numba
 
 
 @pytest.fixture(autouse=True)
@@ -151,23 +151,35 @@ def test_pixels_are_the_lanes(kernel):
     assert packed > max(24, 1.5 * scalar)  # forward has 33 with AVX-512 and twice as many with AVX2
 
 
-IMAGE, MAPS = nb.float32[:, :, ::1], nb.float32[:, :, :, ::1]
-TAPS, SUMS = nb.types.UniTuple(nb.float32, 6), nb.float64[:, ::1]
+ROWS, IMAGE, MAPS = nb.float32[:, ::1], nb.float32[:, :, ::1], nb.float32[:, :, :, ::1]
+NUMBERS, SUMS = nb.float32[::1], nb.float64[:, ::1]
+LENGTHS = [nb.types.UniTuple(nb.float32, count) for count in range(7)]
+FOUND = (nb.float32, NUMBERS, NUMBERS, nb.int64[::1], ROWS, ROWS, nb.int64[:, ::1])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "arguments", "operations"),  # of the loops over columns, in the source
+    ("kernel", "arguments", "pattern", "operations"),  # of the loops over columns, planes or descriptors, in the source
     [
-        ("ssim_maps", (TAPS, IMAGE, IMAGE, IMAGE, IMAGE, MAPS, SUMS), 90),
-        ("ssim_gradient", (TAPS, IMAGE, IMAGE, MAPS, IMAGE), 26),
-        ("total_gradient", (IMAGE, IMAGE, IMAGE, nb.float32, nb.float32, IMAGE), 6),
+        (loss_kernels.ssim_maps, (LENGTHS[6], *[IMAGE] * 4, MAPS, SUMS), "add|sub|mul", 90),
+        (loss_kernels.ssim_gradient, (LENGTHS[6], IMAGE, IMAGE, MAPS, IMAGE), "add|sub|mul", 26),
+        (loss_kernels.total_gradient, (*[IMAGE] * 3, nb.float32, nb.float32, IMAGE), "add|sub|mul", 6),
+        (
+            sweep_kernels.compare_tiles,
+            (ROWS, SUMS, ROWS, LENGTHS[3], IMAGE, nb.float64[:, :, :, ::1], IMAGE),
+            "add|sub",
+            32,
+        ),
+        (sweep_kernels.add_paths, (IMAGE, ROWS, nb.int64, nb.int64, LENGTHS[4], IMAGE), "add|sub|min|cmp", 9),
+        (matching_kernels.find_nearest, (*[ROWS] * 4, *FOUND), "sub", 1),
+        (matching_kernels.find_nearest, (*[ROWS] * 4, *FOUND), "add|mul|fm", 1),
+        (matching_kernels.find_nearest, (*[ROWS] * 4, *FOUND), "and", 1),
     ],
 )
-def test_loops_over_columns_are_vector_code(name, arguments, operations):
+def test_inner_loops_are_vector_code(kernel, arguments, pattern, operations):
     """All that they compute stands in the assembly for whole AVX registers; single numbers are what is left over."""
-    assembly = avx_assembly(getattr(loss_kernels, name), nb.int64, nb.int64, *arguments)
-    assert len(re.findall(r"\bv\w*(?:add|sub|mul)\w*ps\b.*[yz]mm", assembly)) >= operations
+    assembly = avx_assembly(kernel, nb.int64, nb.int64, *arguments)
+    assert len(re.findall(rf"\bv\w*(?:{pattern})\w*p[sd]\b.*[yz]mm", assembly)) >= operations
 
 
 def stamp(kernel):

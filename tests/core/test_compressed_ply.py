@@ -222,7 +222,7 @@ def test_what_is_not_finite_is_refused_and_leaves_the_file_as_it_was(tmp_path: P
     assert (tmp_path / "a.ply").read_bytes() == b"before"
 
 
-def test_the_reader_of_these_tests_reads_what_gsplat_writes(tmp_path: Path) -> None:
+def test_convention_the_reader_of_these_tests_reads_what_gsplat_writes(tmp_path: Path) -> None:
     """So that writer and reader have no mistake in common; gsplat rounds harmonics down, in other steps."""
     exporter = pytest.importorskip("gsplat.exporter")
     model = random_model(200, 1)

@@ -79,7 +79,7 @@ UTM = torch.tensor([448262.127, 5411932.678, 118.5], dtype=torch.float64)  # met
 
 
 @pytest.mark.parametrize(("offset", "dtype"), [(None, np.float32), (UTM, np.float64)], ids=["floats", "doubles"])
-def test_trimesh_reads_all_columns(tmp_path, offset, dtype):
+def test_convention_trimesh_reads_all_columns(tmp_path, offset, dtype):
     model = small_model()
     save_ply(tmp_path / "a.ply", model, offset)
     raw = trimesh.load(tmp_path / "a.ply").metadata["_ply_raw"]["vertex"]["data"]

@@ -1,6 +1,5 @@
 """Normals, features and backgrounds of the renderer."""
 
-import contextlib
 import math
 
 import pytest
@@ -10,8 +9,6 @@ from kornia.sensors.camera import CameraModelType
 
 import kgs
 from kgs import GaussianRenderer
-from kgs.backends import BACKENDS
-from kgs.stages import blend
 
 pytestmark = pytest.mark.usefixtures("each_backend")
 
@@ -71,17 +68,3 @@ def test_an_infinite_background_shows_only_where_light_is_left(shape):
     assert not background.grad.any()
     nothing = kgs.Gaussians(*(x.detach()[:0] for x in inputs))
     assert (GaussianRenderer()(nothing, camera, background).image == math.inf).all()
-
-
-@pytest.mark.parametrize("rounding", [contextlib.nullcontext(), torch.autocast("cpu", torch.bfloat16)])
-def test_one_color_behind_an_image_is_added_as_torch_adds_it(rounding):
-    image, transmittance = torch.rand(2, 3, 5, 7, requires_grad=True), torch.rand(2, 1, 5, 7, requires_grad=True)
-    color = torch.rand(3)
-    weights = torch.rand(2, 3, 5, 7)
-    found = blend(image, transmittance, color, BACKENDS["torch"])
-    expected = torch.addcmul(image, transmittance, color[:, None, None])
-    assert torch.equal(found, expected)
-    with rounding:
-        mine = torch.autograd.grad((found * weights).sum(), (image, transmittance))
-        same = torch.autograd.grad((expected * weights).sum(), (image, transmittance))
-    torch.testing.assert_close(mine, same)

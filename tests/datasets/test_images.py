@@ -36,7 +36,7 @@ def undistort(image: np.ndarray, given: Intrinsics) -> tuple[np.ndarray, Intrins
     return remap(image, maps), pinhole
 
 
-def test_colours_come_as_rgb(tmp_path: Path) -> None:
+def test_convention_colours_come_as_rgb(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), np.full((2, 3, 3), (255, 51, 0), np.uint8))  # blue, green, red
     image = read_image(tmp_path / "a.png")
     assert image.shape == (2, 3, 3)

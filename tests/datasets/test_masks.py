@@ -75,18 +75,6 @@ def test_black_is_looked_away_from(tmp_path: Path, write: str | Callable[[Path],
     assert scene.train.alphas is None
 
 
-@pytest.mark.parametrize("name", ["0_mask.png", "0.png.png", "dynamic_mask_0.png"])
-def test_what_looks_like_masks_among_photos_is_named_and_no_photo(tmp_path: Path, name: str) -> None:
-    """In a layout that takes all photos of a folder."""
-    write_llff(tmp_path)
-    write_mask(tmp_path / "images" / name)
-    scene = load_scene(tmp_path, hold_out=0)
-    assert len(scene.train) == 3
-    assert scene.train.valid_mask is None
-    (note,) = scene.notes
-    assert name in note
-
-
 def test_a_photo_that_a_scene_names_may_look_like_a_mask(tmp_path: Path) -> None:
     write_nerfstudio(tmp_path)
     (tmp_path / "images" / "1.png").rename(tmp_path / "images" / "0_mask.png")
@@ -104,30 +92,6 @@ def test_white_is_the_largest_value_of_a_mask(tmp_path: Path, kind: type[np.uint
     valid = load_scene(tmp_path, hold_out=0).train.valid_mask
     assert valid is not None
     assert [float(kept.float().mean()) for kept in valid] == [0.5, 1, 1]
-
-
-@pytest.mark.parametrize(("kind", "value"), [(np.uint8, 0), (np.uint8, 1), (np.uint16, 255)])
-def test_a_mask_of_one_value_is_refused_with_it(tmp_path: Path, kind: type[np.uint8], value: int) -> None:
-    write_llff(tmp_path)
-    path = write_mask(tmp_path / "masks" / "0.png", np.full((12, 16), value, kind))
-    with pytest.raises(DataError, match=rf"\b{value} everywhere") as error:
-        load_scene(tmp_path, hold_out=0)
-    assert error.value.path == path
-
-
-def test_masks_of_photos_that_are_gone_are_counted(tmp_path: Path) -> None:
-    """Of a model whose photo was deleted, and of one that it has not registered."""
-    write_colmap(tmp_path)
-    for name in ("0", "1", "2", "other"):
-        write_mask(tmp_path / "masks" / f"{name}.png")
-    (tmp_path / "images" / "1.png").unlink()
-    cv2.imwrite(str(tmp_path / "images" / "other.png"), LEFT)
-    scene = load_scene(tmp_path, hold_out=0)
-    assert scene.train.names == ("0.png", "2.png")
-    assert scene.train.valid_mask is not None
-    (note,) = (note for note in scene.notes if "fit no photo" in note)
-    assert "masks/1.png" in note
-    assert "masks/other.png" in note
 
 
 def test_black_is_not_there(tmp_path: Path) -> None:

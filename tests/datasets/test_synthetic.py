@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from kornia.geometry.depth import warp_frame_depth
+from kornia.geometry.depth import depth_to_3d_v2, warp_frame_depth
 
 from kgs.datasets.scene import Scene
-from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
+from kgs.datasets.synthetic import room, synthetic_depths, synthetic_scene
+from kgs.datasets.synthetic.furniture import printed
+from kgs.datasets.synthetic.light import daylight, received
+from kgs.datasets.synthetic.pictures import blank
 from kgs.datasets.synthetic.raycast import CHUNK, _project, raycast
 
 SMALL = (42, 56)
@@ -138,3 +141,76 @@ def _pinhole(height, width):
 def _rays(intrinsics, size):
     v, u = np.mgrid[: size[0], : size[1]]
     return np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(intrinsics).T
+
+
+# -- room ------------------------------------------------------------------------------------------------------------
+
+
+SIZE = (84, 112)
+
+
+@pytest.fixture(scope="module")
+def made():
+    return room.make_room(0)
+
+
+@pytest.fixture(scope="module")
+def depths(scene):
+    return synthetic_depths(scene.train.cameras)
+
+
+def test_test_cameras_lie_between_the_training_cameras_and_outside(scene):
+    train, test = (torch.linalg.inv(v.cameras.extrinsics.double())[:, :3, 3] for v in (scene.train, scene.test))
+    assert torch.cdist(train, test).min() > 0.02
+    low, high = train.amin(0)[:2], train.amax(0)[:2]
+    inside = ((test[:, :2] > low) & (test[:, :2] < high)).all(dim=1)
+    assert 1 <= inside.sum() < len(test)
+    patch = torch.from_numpy(room.PATCH)
+    assert ((test - torch.from_numpy(room.EYE)).abs() < 1.2 * patch).all()
+
+
+def test_depths_of_the_wall_and_the_table_are_those_of_their_planes(scene, depths):
+    """Points unprojected by Kornia lie on z = WALL and on the table's top, y = -TABLE."""
+    for i in range(3):
+        camera = scene.train.camera(i)
+        points = depth_to_3d_v2(depths[i], camera.intrinsics[:, :3, :3].double())[0]
+        motion = torch.linalg.inv(camera.extrinsics[0].double())
+        points = points @ motion[:3, :3].T + motion[:3, 3]
+        on_wall = (points[..., 2] - room.WALL).abs() < 1e-6
+        on_table = (points[..., 1] + room.TABLE).abs() < 1e-6
+        assert on_wall.double().mean() > 0.15
+        assert on_table.double().mean() > 0.03
+        assert (points[..., 2] < room.WALL + 1e-6).all()
+        assert (points[..., 1] < 1e-6).all()  # nothing is under the floor
+
+
+def test_light_is_lamberts_and_a_screen_shades_what_is_behind_it():
+    up = np.array([0.0, -1.0, 0.0])
+    screen = trimesh.creation.box((1.0, 0.02, 1.0)).apply_translation([0.0, -0.5, 0.0])
+    lights = daylight(np.asarray(screen.triangles), up, up)
+    points = np.array([[0.0, 0.0, 0.0], [0.0, -0.52, 0.0], [3.0, 0.0, 0.0], [0.0, -0.52, 0.0]])
+    normals = np.array([up, up, up, [1.0, 0.0, 0.0]])
+    under, above, beside, upright = received(lights, points, normals)
+    np.testing.assert_allclose(above, beside, rtol=1e-5)  # both see the whole sky
+    np.testing.assert_allclose(above - 0.16, [1.24, 1.22, 1.18], rtol=0.02)  # the sun's colour and the sky's
+    assert (under < 0.5 * above).all()
+    assert (upright < 0.5 * above).all()  # half of the sky, none of the sun
+    assert (upright > 0.16).all()
+
+
+def test_a_picture_lies_upright_on_its_rectangle():
+    picture = blank(0.2, 0.1, (0, 0, 0))
+    picture[: len(picture) // 2] = 255, 0, 0
+    picture[:, : picture.shape[1] // 2, 2] = 255
+    paint = printed(picture, 0.2, 0.1)
+    corners = np.array([[-0.09, 0, 0.04], [0.09, 0, 0.04], [-0.09, 0, -0.04], [0.09, 0, -0.04]], dtype=np.float32)
+    np.testing.assert_allclose(paint(corners), [[1, 0, 1], [1, 0, 0], [0, 0, 1], [0, 0, 0]], atol=1e-6)
+
+
+def test_a_room_is_hit_by_every_ray(made):
+    """From the middle of the cameras, far wider than they look: no gap between floor and wall."""
+    matrix = np.array([[40.0, 0, 39.5], [0, 40.0, 29.5], [0, 0, 1]])
+    pose = np.eye(4)
+    pose[:3, 3] = -room.EYE
+    _, faces = raycast(made.triangles, matrix, pose, (60, 80))
+    assert (faces >= 0).all()

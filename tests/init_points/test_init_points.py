@@ -24,7 +24,6 @@ from kornia.geometry.camera import PinholeCamera
 from refusals import refused
 
 from kgs import ArgumentError
-from kgs.app.console import each
 from kgs.geometry.multiview import typical_depths
 from kgs.init_points import initial_points
 
@@ -158,20 +157,6 @@ def test_random_points_where_no_two_views_see_the_same(count):
     points = initial_points(flat(posed), "random", count=100).points
     assert points.shape == (100, 3)
     assert int(seeing_views(posed, points).min()) == 1
-
-
-@pytest.mark.slow
-def test_each_stage_says_how_far_it_is(planes, capsys):
-    small = planes.downsample(2)
-    initial_points(small, "dense")
-    assert capsys.readouterr() == ("", "")  # nothing unless asked for
-    initial_points(small, "dense", bar=each)
-    lines = capsys.readouterr().err.splitlines()
-    assert lines == [
-        *(f"keypoints: {k} of 3 views" for k in (1, 2, 3)),
-        *(f"matches: {k} of 3 pairs" for k in (1, 2, 3)),
-        *(f"depth maps: {k} of 3 views" for k in (1, 2, 3)),
-    ]
 
 
 @pytest.mark.parametrize(

@@ -39,34 +39,22 @@ _BORDER = 0.03  # of the shorter side of a photo: the band whose mean is the gro
 def write_fit_page(
     path: Path,
     title: str,
-    fits: Mapping[str, Fit],
+    fits: Mapping[str, Fit],  # of one scene, with metrics, by the name of the run; "" for a single one
     *,
     beside: Views | None = None,
-    words: tuple[str, str] = ("training", "test"),
+    words: tuple[str, str] = ("training", "test"),  # what training and test views are called
     notes: Sequence[str] = (),
     remarks: Sequence[str] = (),
-    settings: Mapping[str, Any] | None = None,
-    report: Path | None = None,
-    photos: bool = True,
-    roll: float = 0.0,
-    small: Views | None = None,
+    settings: Mapping[str, Any] | None = None,  # the content of config.json
+    report: Path | None = None,  # photos.json, if it is there and can be read
+    photos: bool = True,  # whether the page shows photos, renders and their differences
+    roll: float = 0.0,  # degrees by which all pictures are turned clockwise
+    small: Views | None = None,  # some of the views with pixels, for the thumbnails; None: those of the scene
 ) -> str:
     """Write the page of one or more fits of a scene; the viewer shows the last of them.
 
-    Args:
-        path: the file to write.
-        title: of the page.
-        fits: of one scene, with metrics, by the name of the run; "" for a single one.
-        beside: the views to show beside their renders; only these need pixels. None: up to `MAX_PICTURES` test views,
-            or training views if there are no test views.
-        words: what training and test views are called.
-        notes: sentences to show below the one that says how good the fit is.
-        remarks: sentences to show under Details.
-        settings: the content of config.json.
-        report: a JSON file about how the cameras were found; ignored if it does not exist or cannot be read.
-        photos: whether the page shows photos, renders and their differences.
-        roll: degrees by which all pictures are turned clockwise, see :func:`kgs.app.files.cameras.rolled`.
-        small: some of the views with pixels, for the thumbnails. None: those of the scene.
+    The views `beside` their renders need pixels, others do not. Unless given, they are up to `MAX_PICTURES` test views,
+    or training views if there are no test views.
 
     Returns:
         What the viewer shows less than the model, in words; "" for nothing.

@@ -22,27 +22,16 @@ _THUMBNAIL_SIZES = ((96, 80), (96, 65), (80, 60), (64, 50), (48, 40))  # height 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A photo and its renders.
+    """A photo and its renders."""
 
-    Args:
-        name: file name of the photo.
-        photo: RGB in [0, 1], `(3, H, W)`.
-        renders: RGB, `(3, H, W)`, by the name of the run; "" if there is only one run.
-        caption: text above the images; "": the name.
-    """
-
-    name: str
-    photo: Tensor
-    renders: dict[str, Tensor] = field(default_factory=dict)
-    caption: str = ""
+    name: str  # of the photo's file
+    photo: Tensor  # RGB in [0, 1], `(3, H, W)`
+    renders: dict[str, Tensor] = field(default_factory=dict)  # likewise, by the name of the run; "" if there is one
+    caption: str = ""  # above the images; "": the name
 
 
 def encoded(pictures: Sequence[Picture], max_bytes: int) -> list[dict[str, Any]]:
     """Encode all pictures in the largest size in which their data URIs fit into `max_bytes`, or in the smallest one.
-
-    Args:
-        pictures: photos with their renders.
-        max_bytes: limit for all data URIs together. It can be exceeded in the smallest size.
 
     Returns:
         For each picture its name, its caption, the data URI of its photo, and its renders as tuples of the run, the
@@ -65,10 +54,6 @@ def in_strip(names: Sequence[str]) -> list[int]:
 
 def thumbnails(photos: Sequence[Tensor], max_bytes: int) -> list[dict[str, Any]]:
     """Encode photos in the largest size in which their data URIs fit into `max_bytes`, or in the smallest one.
-
-    Args:
-        photos: RGB in [0, 1], each `(3, H, W)`.
-        max_bytes: limit for all data URIs together. It can be exceeded in the smallest size.
 
     Returns:
         For each photo its data URI (photo), and its width and height in pixels.

@@ -40,11 +40,6 @@ def write_page(path: Path, content: PageContent, max_bytes: int = MAX_BYTES) -> 
     they are given. The splat is packed into the bytes that the rest of the page leaves, see
     :func:`kgs.app.page.data.pack`.
 
-    Args:
-        path: the file to write.
-        content: what the page shows.
-        max_bytes: limit for the page.
-
     Returns:
         What the viewer shows less than the splat, in words, see :class:`kgs.app.page.data.Packed`; "" for nothing.
 
@@ -108,12 +103,7 @@ class _Page:
         self._template = environment.get_template("page.html.jinja")
 
     def html(self, packed: Packed | None = None, page_bytes: int = 0) -> bytes:
-        """The whole file.
-
-        Args:
-            packed: the splat; None leaves it out.
-            page_bytes: the size that the page says it has. The text is equally long for all sizes below 10 MB.
-        """
+        """The whole file, which says that it has `page_bytes`: the text is equally long for all sizes below 10 MB."""
         from markupsafe import Markup
 
         splat = {}

@@ -78,32 +78,17 @@ class Accepted(NamedTuple):
 
 
 def accepted_cameras(
-    photos: list[Photo],
-    images: Path,
-    masks: Path,
-    work: Path,
-    names: Mapping[str, str],
+    photos: list[Photo],  # all of one size
+    images: Path,  # the folder where they are as PNGs
+    masks: Path,  # that of their masks, which exists if there are any
+    work: Path,  # a folder for what the solvers write
+    names: Mapping[str, str],  # of the photos by those of the PNGs, in the order of `photos`
     seed: int,
     bar: ProgressBar,
-    lap: Callable[[str], None],
+    lap: Callable[[str], None],  # called with the name of each part at its end
     say: Callable[[str], None],
 ) -> Accepted:
-    """The cameras of as many photos as two solvers agree on.
-
-    Args:
-        photos: the photos, all of one size.
-        images: the folder where they are as PNGs.
-        masks: the folder of their masks, which exists if there are any.
-        work: a folder for what the solvers write.
-        names: the names of the photos by those of the PNGs, in the order of `photos`.
-        seed: of the solvers.
-        bar: wraps the loops to show their progress, see :mod:`kgs._support.progress`.
-        lap: called with the name of each part at its end.
-        say: called with each line for the user.
-
-    Raises:
-        PhotosRefused: the photos do not fit together, or not even three cameras can be trusted.
-    """
+    """The cameras of as many photos as two solvers agree on; PhotosRefused if these are not even three."""
     folder = photos[0].path.parent
     size = photos[0].size
     lenses = lenses_of(photos)
@@ -131,13 +116,13 @@ def accepted_cameras(
             kept = {image: name for image, name in kept.items() if name not in rejected}
             solutions, held = consensus.solve(kept)
         lap("cameras")
-    say_left_out(rejected, say)
+    say_rejected(rejected, say)
     forward = went_forward(geometries)
     which, degrees = check(folder, solutions, list(kept.values()), max(size), pairs, forward=forward)
     return Accepted(solutions[which], SOLVERS[which], degrees, held, pairs, rejected)
 
 
-def say_left_out(rejected: Mapping[str, str], say: Callable[[str], None]) -> None:
+def say_rejected(rejected: Mapping[str, str], say: Callable[[str], None]) -> None:
     """Say which photos are left out, and why, a line each."""
     for name, why in rejected.items():
         say(f"left out: {name}: {why}")
@@ -154,11 +139,7 @@ class Consensus:
     pairs: Pairs
 
     def solve(self, names: Mapping[str, str]) -> tuple[Solutions, list[float]]:
-        """What each solver finds, and the focal lengths of the Exif where only these tell them, else [].
-
-        Args:
-            names: those of the photos to register, by those of their images.
-        """
+        """What each solver finds, and the focal lengths of the Exif where only these tell them, else []."""
         free = self._both(lambda i: self._solve(i, names))
         solutions, held = self._hold_focals_in_doubt(free, names)
         if not doubtful(solutions, list(names.values()), self.pairs):
@@ -200,10 +181,10 @@ class Consensus:
 def retry(
     solver: Solver,
     names: Mapping[str, str],
-    focals: Sequence[float],
-    found: Cameras,
-    other: Cameras,
-    photos: Set[str],
+    focals: Sequence[float],  # as of `Solver.solve`
+    found: Cameras,  # by this solver
+    other: Cameras,  # by the other one
+    photos: Set[str],  # to be registered again
 ) -> Cameras:
     """The best of what a solver found and of its further tries, which end as soon as all photos are registered well.
 
@@ -215,14 +196,6 @@ def retry(
 
     A try is judged by what the solver itself sees: how many photos with enough points, then how many points. It is
     never judged by how well it agrees with the other solver: of many tries one would agree by chance.
-
-    Args:
-        solver: whose tries they are.
-        names: as `focals`, see :meth:`kgs.app.sfm.map.Solver.solve`.
-        focals: the focal length of each lens in pixels if they are known; (): they are adjusted.
-        found: what it found.
-        other: what the other solver found.
-        photos: those that are to be registered again.
     """
     best = found
     all_photos = set(names.values())
@@ -287,7 +260,11 @@ def _registered_badly(first: Cameras, second: Cameras, names: Sequence[str], pai
     """The photos that a solver failed to register, that see few points, or whose lens is disputed, and why."""
     left = dict[str, str]()
     registered = [name for name in names if name in first.points and name in second.points]
-    better = max((first, second), key=lambda found: _worst_seen(found, registered))
+
+    def seen(found: Cameras) -> tuple[int, int]:
+        return len(seen_well(found, registered)), min((found.points[name] for name in registered), default=0)
+
+    better = max((first, second), key=seen)
     for name in names:
         advice = what_would_help(name, [other for other in names if other != name], pairs)
         if name not in registered:
@@ -301,11 +278,6 @@ def _registered_badly(first: Cameras, second: Cameras, names: Sequence[str], pai
                 factor = f"{max(ratio, 1 / ratio):.3g}"
                 left[name] = f"two solvers differ by a factor of {factor} about the focal length of its lens"
     return left
-
-
-def _worst_seen(cameras: Cameras, names: Sequence[str]) -> tuple[int, int]:
-    """How many photos see enough points, and how many the worst one sees."""
-    return len(seen_well(cameras, names)), min((cameras.points[name] for name in names), default=0)
 
 
 def _disputed(first: Cameras, second: Cameras, names: Sequence[str]) -> dict[str, str]:
@@ -340,18 +312,8 @@ def check(
 ) -> tuple[int, float]:
     """The index of the cameras that pass the acceptance checks, and the solvers' largest difference in degrees.
 
-    If both pass, it is that of those whose worst photo sees more points.
-
-    Args:
-        folder: of the photos, which errors name.
-        solutions: what the two solvers found.
-        names: the names of all photos.
-        longest: the longer side of the photos in pixels.
-        pairs: verified matches of each pair.
-        forward: whether the camera moved along its view, which is what a refusal then speaks of.
-
-    Raises:
-        PhotosRefused: none pass.
+    If both pass, it is that of those whose worst photo sees more points. If none does, PhotosRefused names the folder;
+    where the camera moved along its view, it speaks of that.
     """
 
     def refuse(reason: str, advice: str) -> NoReturn:

@@ -58,27 +58,20 @@ class Solver:
 
     def solve(
         self,
-        names: Mapping[str, str],
-        focals: Sequence[float] = (),
+        names: Mapping[str, str],  # of the photos to register, by those of the images in the database
+        focals: Sequence[float] = (),  # of each lens in pixels if they are known; (): they are adjusted
         *,
-        attempt: int = 0,
-        first_pair: tuple[str, str] | None = None,
+        attempt: int = 0,  # added to the seed
+        first_pair: tuple[str, str] | None = None,  # images that are registered first; None: the mapper chooses
         start: Cameras | None = None,
-        at_least: int = 0,
+        at_least: int = 0,  # photos that have to be registered; where the first round has fewer, there are none
     ) -> Cameras:
         """Cameras and points of as many photos as can be registered: `NO_CAMERAS` if no pair can be.
 
         Lenses are held while photos are registered, because two photos do not determine them, and adjusted to all of
-        them after that. This is repeated with the lenses that came out until they no longer change.
-
-        Args:
-            names: the names of the photos to register, by those of the images in the database.
-            focals: the focal length of each lens in pixels if they are known; (): they are adjusted.
-            attempt: added to the seed.
-            first_pair: the images in the database that are registered first; None: the mapper chooses.
-            start: cameras of other matches that are there before any photo is registered. Their points are
-                triangulated again, from the matches of the database, and then the cameras are adjusted to these.
-            at_least: how many photos have to be registered; where the first round registers fewer, there are none.
+        them after that. This is repeated with the lenses that came out until they no longer change. With a `start`,
+        cameras of other matches, their points are triangulated from the matches of the database before any photo is
+        registered, and then the cameras are adjusted to these.
         """
         best = None
         error = 0.0
@@ -228,18 +221,10 @@ def _bundle_adjust(
     *,
     hold_focal: bool,
     hold_distortion: bool = False,
-    factor: float = 1.0,
-    distortion: float | None = None,
+    factor: float = 1.0,  # by which focal lengths are multiplied first
+    distortion: float | None = None,  # at which the radial distortions are held
 ) -> tuple[Any, float]:
-    """A copy, adjusted until it converges, and half its sum of squared errors in pixels.
-
-    Args:
-        reconstruction: pycolmap's.
-        hold_focal: whether focal lengths stay.
-        hold_distortion: whether radial distortions stay.
-        factor: by which focal lengths are multiplied first.
-        distortion: at which the radial distortions are held instead.
-    """
+    """A copy, adjusted until it converges, and half its sum of squared errors in pixels."""
     scene = copy.deepcopy(reconstruction)
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False

@@ -48,15 +48,7 @@ def find_keypoints(photo: Photo, max_count: int) -> PhotoKeypoints:
 
 
 def write_matches(database: Path, photos: list[Photo], names: list[str], lenses: list[Any], bar: ProgressBar) -> None:
-    """Make a COLMAP database of all photos with their lenses, their keypoints and the matches of each pair.
-
-    Args:
-        database: the file to write.
-        photos: the photos, all of one size.
-        names: their names in the database.
-        lenses: first guesses of their lenses, see :func:`lenses_of`.
-        bar: wraps the loops to show their progress, see :mod:`kgs._support.progress`.
-    """
+    """Make a COLMAP database of photos of one size with their lenses, keypoints and the matches of each pair."""
     # The cost of matching grows with the squares of both counts, so many photos get fewer keypoints each.
     max_count = min(MAX_KEYPOINTS, max(MIN_KEYPOINTS, ALL_KEYPOINTS // len(photos)))
     keypoints = [find_keypoints(photo, max_count) for photo in bar(photos, "keypoints", "photo")]

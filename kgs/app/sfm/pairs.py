@@ -75,12 +75,7 @@ def without_overlap(
     """Photos that cannot help, by their matches alone, and why.
 
     The second of two photos from one place, and photos outside the largest group that overlapping pairs connect, if
-    that is larger than any other.
-
-    Args:
-        names: the names of all photos.
-        pairs: verified matches of each pair.
-        geometries: what the matches of each overlapping pair say about depth.
+    that is larger than any other. `geometries` are those of overlapping pairs.
     """
     left = {
         second: f"it shows the same from the same place as {first}"
@@ -101,13 +96,7 @@ def without_overlap(
 
 
 def why_no_cameras(names: Sequence[str], pairs: Pairs, geometries: Mapping[tuple[str, str], PairGeometry]) -> str:
-    """Why matches fail to give cameras, and what to photograph next, as the advice of an error, or "".
-
-    Args:
-        names: the names of all photos.
-        pairs: verified matches of each pair.
-        geometries: what the matches of each overlapping pair say about depth.
-    """
+    """Why matches fail to give cameras, and what to photograph next, as the advice of an error, or ""."""
     if twins := [pair for pair, geometry in geometries.items() if geometry.shift < _MIN_SHIFT]:
         one, other = twins[0]
         return (

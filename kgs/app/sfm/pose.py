@@ -12,12 +12,12 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import cv2
-import torch
 
 from kgs._support.errors import DataError, printable
 from kgs._support.json_files import read_json, write_json
 from kgs._support.machine import versions
 from kgs._support.progress import ProgressBar, silent
+from kgs._support.torch_threads import torch_on_one_thread
 from kgs.app.console import each, say
 from kgs.app.files.fit_files import has_fit
 from kgs.app.files.outputs import png_names
@@ -34,7 +34,7 @@ from .accept import (
     MIN_RISE,
     Accepted,
     accepted_cameras,
-    say_left_out,
+    say_rejected,
 )
 from .find import notes_on
 from .map import Cameras
@@ -117,16 +117,7 @@ def pose(
 ) -> dict[str, Any]:
     """As :func:`pose_photos`, in a folder that is open.
 
-    Args:
-        source: the photos or the video.
-        results: the folder.
-        seed: of the solvers.
-        masks: the folder of their masks.
-        frames: the number of frames that are taken from a video.
-        for_fit: write new files to `results.work`, until a fit to them is done: a former one in the folder belongs to
-            the former cameras.
-        bar: wraps the loops to show their progress.
-        say: called with each line for the user.
+    New files for a fit are in `results.work` until it is done: a former one in the folder belongs to former cameras.
     """
     if source.video is not None:
         return _pose_video(source.video, results, frames, seed=seed, masks=masks, for_fit=for_fit, bar=bar, say=say)
@@ -145,7 +136,7 @@ def pose(
     for folder in (results.work, results.out) if for_fit else (results.out,):
         if (report := _reusable_report(folder, inputs)) is not None:
             say(f"cameras: those in {printable(folder)} are of the same {len(opened)} photos and are used again")
-            say_left_out(report.get("left_out", {}), say)
+            say_rejected(report.get("left_out", {}), say)
             return {**report, "reused": True, "folder": str(folder)}
     with _new_folder(results, for_fit) as new:
         report = inputs | find_cameras(opened, new, seed % 2**31, bar, say)
@@ -209,7 +200,7 @@ def find_cameras(
     """
     seconds, lap = _clock()
     unlike = unlike_others(opened)
-    say_left_out(unlike, say)
+    say_rejected(unlike, say)
     opened = [photo for photo in opened if photo.name not in unlike]
     png = png_names([photo.name for photo in opened])
     names = {image: name for name, image in png.items()}
@@ -335,12 +326,10 @@ def report_full_disk(folder: Path) -> Iterator[None]:
 @contextmanager
 def _one_thread() -> Iterator[None]:
     """Run torch and OpenCV on one thread: their rounding depends on the number of threads."""
-    threads_of_torch = torch.get_num_threads()
-    threads_of_opencv = cv2.getNumThreads()
-    torch.set_num_threads(1)
+    before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        yield
+        with torch_on_one_thread():
+            yield
     finally:
-        torch.set_num_threads(threads_of_torch)
-        cv2.setNumThreads(threads_of_opencv)
+        cv2.setNumThreads(before)

@@ -238,10 +238,7 @@ def _cut(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
 def _reduced(image: Image, size: tuple[int, int], kept: Image | None) -> NDArray[np.uint8]:
     """An image of 8 bits with this width and height, of the visible colours of the given one alone.
 
-    Args:
-        image: RGB or RGBA, not premultiplied, in [0, 1].
-        size: width and height.
-        kept: the share of each pixel that a mask keeps, `(H, W)`; None: all of it.
+    It is RGB or RGBA, not premultiplied, in [0, 1]; `kept` is the share of each pixel that a mask keeps, `(H, W)`.
     """
     if image.shape[2] == 3:
         return _eight_bits(reduce(image, *size, kept))
