@@ -6,11 +6,12 @@ import torch
 import trimesh
 from kornia.geometry.depth import depth_to_3d_v2
 
-from kgs.datasets.synthetic import room, synthetic_depths, synthetic_scene, world
+from kgs.datasets.synthetic import room, synthetic_depths, synthetic_scene, views_beyond, world
 from kgs.datasets.synthetic.furniture import Part, plain, printed
 from kgs.datasets.synthetic.light import daylight, received
 from kgs.datasets.synthetic.pictures import blank
 from kgs.datasets.synthetic.raycast import raycast
+from kgs.geometry.rigs import camera_centers
 
 SIZE = (84, 112)
 
@@ -129,3 +130,12 @@ def test_a_room_is_hit_by_every_ray(made):
     pose[:3, 3] = -room.EYE
     _, faces = raycast(made.triangles, matrix, pose, (60, 80))
     assert (faces >= 0).all()
+
+
+@pytest.mark.slow
+def test_cameras_before_the_room_lie_so_many_times_as_far_out():
+    for out in (1.0, 2.5):
+        centers = camera_centers(views_beyond(out, 4, (6, 8)).cameras.extrinsics).numpy()
+        flat = (centers - room.EYE)[:, :2] / room.PATCH[:2]
+        np.testing.assert_allclose(np.linalg.norm(flat, axis=1), out, rtol=1e-4)
+        np.testing.assert_allclose(centers[:, 2], room.EYE[2], atol=1e-5)

@@ -6,7 +6,6 @@ import math
 import re
 import sys
 from collections import Counter
-from dataclasses import replace
 from itertools import product
 
 import cv2
@@ -16,10 +15,9 @@ import torch
 from study_rows import tiny_cell
 
 from kgs.app.cli import main
-from kgs.datasets import load_scene
 from kgs.fit.config import FitConfig
 from kgs.study import cells as cells_module
-from kgs.study.cells import FULL, sparse_cell
+from kgs.study.cells import sparse_cell
 from kgs.study.presets import AUTO, AUTO_OFF, GUARD, MAIN, METHODS, SCENES, sparse_cells
 
 
@@ -58,7 +56,7 @@ def test_a_package_that_is_missing_is_named_before_any_work(package, tmp_path, m
     assert not list(tmp_path.rglob("*.jsonl"))
 
 
-@pytest.mark.parametrize("preset", ["quick", "cpu", "field", "field-long", "paper", "guard"])
+@pytest.mark.parametrize("preset", ["quick", "cpu", "field", "paper", "guard"])
 def test_each_cell_is_there_once_and_is_a_fit(preset, guarded):
     cells = sparse_cells(preset, guarded)
     assert len({json.dumps(cell, sort_keys=True) for cell in cells}) == len(cells)
@@ -89,9 +87,6 @@ def test_the_preset_field_begins_with_what_no_later_recipe_changes(data):
     joined = [cell for cell in sparse_cells("field", data) if cell not in cells]
     fountain = [("colmap/fountain", 3), ("colmap/fountain", 6)]
     assert settings(joined) == all_seeds(fountain, ("off", "progressive 0.2", AUTO, AUTO_OFF))
-    long = sparse_cells("field-long", data)
-    assert len(long) == 27
-    assert {cell["fit"]["steps"] for cell in long} == {10_000}
 
 
 def test_the_preset_cpu_holds_what_the_study_must_show(data):
@@ -175,29 +170,6 @@ def test_a_scene_on_the_disk_and_its_own_points(folder):
     assert "come with the layout" in result["protocol"]["init"]
     assert result["protocol"]["image_size"] == [18, 20]
     assert (result["config"]["steps"], result["config"]["drop"]) == (3, 0.0)
-
-
-def test_the_upper_bound_has_the_points_of_all_photos(folder, monkeypatch):
-    """It is moved into the frame of the few views, and drawn by the seed."""
-    cloud = torch.rand(12_000, 3, dtype=torch.float64) * 4 - 2  # in the world of the files
-
-    def with_points(path, views=None, downscale=None, points="none", photo_folder=""):
-        loaded = load_scene(path, views, downscale)
-        if views is not None:
-            return loaded
-        assert points == "model-points"
-        return replace(loaded, points=(cloud - loaded.offset).float(), point_colors=torch.zeros(len(cloud), 3))
-
-    monkeypatch.setattr(cells_module, "load_scene", with_points)
-    few, first, _ = cells_module._start(str(folder.parent), folder.name, 2, None, FULL, 0, "paper")
-    _, other, _ = cells_module._start(str(folder.parent), folder.name, 2, None, FULL, 1, "paper")
-    assert len(first.points) == 10_000
-    assert not torch.equal(first.points, other.points)
-    nearest = torch.cdist(first.points[:100].double() + few.offset, cloud).amin(1)
-    assert float(nearest.max()) < 1e-5
-    result = sparse_cell(tiny_cell(start=FULL) | {"scene": folder.name}, data=str(folder.parent))
-    assert result["init"]["kind"] == FULL
-    assert "not allowed" in result["protocol"]["init"]
 
 
 @pytest.mark.slow
