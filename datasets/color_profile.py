@@ -5,7 +5,6 @@ Sources: Adobe RGB (1998) Color Image Encoding; IEC 61966-2-1 (sRGB).
 
 import io
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 import PIL.Image
@@ -18,21 +17,13 @@ Profile = bytes | str  # an ICC profile, or one of these names; empty where a fi
 _PROFILE_OF_SRGB = ImageCms.createProfile("sRGB")
 _SAME = 3  # levels of 255: a profile that changes no colour by more than this is sRGB under another name
 _PROBE = np.stack(np.meshgrid(*[np.linspace(0, 255, 9).round()] * 3, indexing="ij"), axis=-1).astype(np.uint8)
-_MODES = {"RGB": "RGB", "GRAY": "L"}  # those of Pillow by the space of a profile
+_PROBE = _PROBE.reshape(27, 27, 3)
 _ROWS = 256  # that are converted at once: what is needed for more takes memory
 _ADOBE_GAMMA = 563 / 256
 # From its linear light to that of sRGB, which has the same white.
 _ADOBE_TO_SRGB = np.array(
     [[1.398355743961, -0.398355743961, 0.0], [0.0, 1.0, 0.0], [0.0, -0.042928989294, 1.042928989294]], np.float32
 )
-
-
-class _Transform(NamedTuple):
-    """What turns 8-bit colours of a profile into sRGB."""
-
-    transform: ImageCms.ImageCmsTransform
-    mode: str  # "RGB", or "L" for grey
-    moves: bool  # whether it changes any colour
 
 
 def to_srgb(image: NDArray[np.float32], profile: Profile) -> NDArray[np.float32]:
@@ -47,52 +38,34 @@ def to_srgb(image: NDArray[np.float32], profile: Profile) -> NDArray[np.float32]
         where :func:`is_usable` says that the profile is not.
     """
     if profile == ADOBE_RGB:
-        return _from_adobe(image)
+        converted = image.copy()
+        for rows in np.array_split(converted, range(_ROWS, len(converted), _ROWS)):  # views
+            light = np.clip(rows[..., :3] ** _ADOBE_GAMMA @ _ADOBE_TO_SRGB.T, 0, 1)
+            rows[..., :3] = np.where(light <= 0.0031308, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055)
+        return converted
     transform = _transform(profile) if isinstance(profile, bytes) else None
-    if transform is None or not transform.moves:
+    if transform is None or np.abs(_apply(transform, _PROBE).astype(int) - _PROBE).max() <= _SAME:
         return image
-    levels = (image[..., :3] * 255).round().astype(np.uint8)
-    if transform.mode == "L":
-        if (levels != levels[..., :1]).any():  # a profile of grey in an image of colours
-            return image
-        levels = levels[..., 0]
     converted = image.copy()
-    converted[..., :3] = _apply(transform.transform, levels) / np.float32(255)
+    converted[..., :3] = _apply(transform, (image[..., :3] * 255).round().astype(np.uint8)) / np.float32(255)
     return converted
 
 
 def is_usable(profile: Profile) -> bool:
-    """Whether a profile can be used: it is none, a name, or an undamaged one of RGB or grey."""
+    """Whether a profile can be used: it is none, a name, or an undamaged one of RGB."""
     return isinstance(profile, str) or _transform(profile) is not None
 
 
 @lru_cache(maxsize=4)  # the photos of a scene have one or two profiles
-def _transform(profile: bytes) -> _Transform | None:
-    """None where a profile is damaged, or not one of RGB or grey."""
+def _transform(profile: bytes) -> ImageCms.ImageCmsTransform | None:
+    """What turns 8-bit colours of a profile into sRGB; None where it is damaged, or not one of RGB."""
+    intent = ImageCms.Intent.RELATIVE_COLORIMETRIC
     try:
         source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
-        mode = _MODES.get(source.profile.xcolor_space.strip())
-        if mode is None:
-            return None
-        intent = ImageCms.Intent.RELATIVE_COLORIMETRIC
-        transform = ImageCms.buildTransform(source, _PROFILE_OF_SRGB, mode, "RGB", renderingIntent=intent)
+        return ImageCms.buildTransform(source, _PROFILE_OF_SRGB, "RGB", "RGB", renderingIntent=intent)
     except (OSError, ImageCms.PyCMSError):  # as other damaged metadata
         return None
-    probe = _PROBE.reshape(27, 27, 3)
-    if mode == "L":
-        probe = np.arange(256, dtype=np.uint8).reshape(16, 16, 1).repeat(3, axis=2)
-    moved = np.abs(_apply(transform, probe if mode == "RGB" else probe[..., 0]).astype(int) - probe).max()
-    return _Transform(transform, mode, bool(moved > _SAME))
 
 
 def _apply(transform: ImageCms.ImageCmsTransform, levels: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(transform.apply(PIL.Image.fromarray(np.ascontiguousarray(levels))))
-
-
-def _from_adobe(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """An image of Adobe RGB in sRGB; what sRGB has no numbers for is clipped."""
-    converted = image.copy()
-    for rows in np.array_split(converted, range(_ROWS, len(converted), _ROWS)):  # views
-        light = np.clip(rows[..., :3] ** _ADOBE_GAMMA @ _ADOBE_TO_SRGB.T, 0, 1)
-        rows[..., :3] = np.where(light <= 0.0031308, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055)
-    return converted

@@ -8,8 +8,26 @@ import re
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
+from typing import NamedTuple
 
 from kgs._support.errors import DataError, listed, quantity
+
+
+class Layout(NamedTuple):
+    """How the files of a scene lie in its folder."""
+
+    file: str = ""  # says where the cameras are; "": a COLMAP model does
+    has_sizes: bool = False  # the same photos may be there in several sizes, a folder for each
+
+
+# In the order in which they are looked for. The function `load` in layouts/x.py reads layout X.
+LAYOUTS = {
+    "LLFF": Layout("poses_bounds.npy", has_sizes=True),
+    "COLMAP": Layout(has_sizes=True),
+    "Blender": Layout("transforms_train.json"),
+    "nerfstudio": Layout("transforms.json"),
+}
+POSE_FILES = tuple(layout.file for layout in LAYOUTS.values() if layout.file)
 
 _JPEG = (".jpg", ".jpeg", ".jpe", ".jfif", ".jif", ".pjpeg", ".pjp")
 IMAGE_SUFFIXES = (".png", *_JPEG, ".webp", ".bmp", ".dib", ".tif", ".tiff")
@@ -25,8 +43,6 @@ _OTHERS = (
 UNREADABLE_SUFFIXES = (*_RAW, *HEIC_SUFFIXES, *_OTHERS)
 PICTURE_SUFFIXES = (*IMAGE_SUFFIXES, *UNREADABLE_SUFFIXES)
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".3gp", ".mpg", ".mpeg", ".mts")
-# What says where the cameras of a scene are, in the order in which it is looked for; a COLMAP model comes second.
-LAYOUT_FILES = {"LLFF": "poses_bounds.npy", "Blender": "transforms_train.json", "nerfstudio": "transforms.json"}
 CAMERAS_REPORT = "photos.json"  # beside a scene whose cameras kgs found: how they were found
 _MAY_HOLD_CAMERAS = (".json", ".xml", ".xmp", ".csv", ".nvm", ".out", ".sfm", ".npy", ".npz", ".traj", ".r3d")
 MASKS = "masks"  # the folder of masks
@@ -110,13 +126,10 @@ def find_models(root: Path) -> list[Path]:
 def layout_of(root: Path) -> str | None:
     """The layout of a scene's folder: LLFF, COLMAP, Blender or nerfstudio; None where it is not a scene."""
     models = find_models(root)
-    if (root / LAYOUT_FILES["LLFF"]).is_file():
-        return "LLFF"
-    if models and models != [root]:
-        return "COLMAP"
-    for layout in ("Blender", "nerfstudio"):
-        if (root / LAYOUT_FILES[layout]).is_file():
-            return layout
+    is_in_sparse = models[:1] not in ([], [root])  # a model beside the photos comes after all other layouts
+    for name, layout in LAYOUTS.items():
+        if (root / layout.file).is_file() if layout.file else is_in_sparse:
+            return name
     return "COLMAP" if models else None
 
 
@@ -131,7 +144,7 @@ def _is_model(folder: Path) -> bool:
 def unused_files(root: Path, layout: str | None = None) -> tuple[str, ...]:
     """What a folder holds besides the files of its layout that says, or may say, where cameras are: a sentence each."""
     if layout is not None:
-        others = [name for other, name in LAYOUT_FILES.items() if other != layout and (root / name).is_file()]
+        others = [name for name in POSE_FILES if name != LAYOUTS[layout].file and (root / name).is_file()]
         others += ["the COLMAP model"] if _is_model(root) and layout in ("Blender", "nerfstudio") else []
         return tuple(f"{name} is not used: the scene is read as {layout}" for name in others)
     sentences = []
@@ -139,7 +152,7 @@ def unused_files(root: Path, layout: str | None = None) -> tuple[str, ...]:
         sentences.append("the COLMAP model is not used: expected its photos beside it or in images/")
     files = [path for path in sorted(root.iterdir()) if path.suffix.lower() in _MAY_HOLD_CAMERAS]
     if names := [path.name for path in files if path.name[0] != "." and path.is_file()]:
-        read = f"{', '.join(LAYOUT_FILES.values())} and COLMAP models"
+        read = f"{', '.join(POSE_FILES)} and COLMAP models"
         sentences.append(f"cameras in {listed(names)} would not be read: kgs reads those in {read}")
     return tuple(sentences)
 
@@ -164,7 +177,7 @@ def no_scene(root: Path) -> DataError:
     if not root.is_dir():
         meant = f"for photos, name their folder: {root.parent}" if root.suffix.lower() in PICTURE_SUFFIXES else ""
         return DataError(root, "", "a folder", "a file", advice=meant)
-    advice = f"there is no {', '.join(LAYOUT_FILES.values())} or COLMAP model in sparse/0"
+    advice = f"there is no {', '.join(POSE_FILES)} or COLMAP model in sparse/0"
     if count := len(list_images(image_folder(root) or root, PICTURE_SUFFIXES)):
         got = f"{quantity(count, 'photo')} without camera poses"
         advice = "kgs fit finds them, or COLMAP (its model goes to sparse/0)"

@@ -51,11 +51,8 @@ _RGB_OF_FULL_RANGE = (0, 1)
 _UNSPECIFIED = (2, 2)
 _SRGB_CHROMATICITIES = (0.3127, 0.3290, 0.64, 0.33, 0.30, 0.60, 0.15, 0.06)  # x and y of white, red, green and blue
 _SRGB_GAMMA = 1 / 2.2  # nearly, as libpng has it
-# Values of tags of TIFF and Exif
-_WHITE_IS_ZERO = 0  # of `Base.PhotometricInterpretation`
-_SEPARATE = 2  # of `Base.PlanarConfiguration`
-_ALPHA = 2  # of `Base.ExtraSamples`
-_OTHER_SAMPLES = {0: "a channel of no stated meaning", 1: "colours multiplied by alpha"}  # likewise
+_SEPARATE = 2  # of a TIFF's `Base.PlanarConfiguration`
+_STRAIGHT_ALPHA = 2  # of its `Base.ExtraSamples`
 _IS_SRGB, _IS_ADOBE_RGB, _UNCALIBRATED = 1, 2, 65535  # of `Base.ColorSpace`, the second of some cameras
 
 
@@ -129,17 +126,15 @@ class ImageFile:
         self._data = None
         return to_srgb(np.asarray(pixels / np.float32(2 ** max(8, metadata.bits) - 1), np.float32), metadata.profile)
 
-    @property
-    def is_doubtful(self) -> bool:
-        """Whether its colours are taken for sRGB although its file may mean others."""
-        header = self.metadata
-        is_unnamed = not header.profile and header.tags.get(Base.ColorSpace) == _UNCALIBRATED
-        return is_unnamed or not is_usable(header.profile)
-
 
 def color_notes(images: Sequence[ImageFile]) -> list[str]:
     """A sentence that names photos whose colours may be others than sRGB; or []."""
-    names = [image.path.name for image in images if image.is_doubtful]
+    names = []
+    for image in images:
+        header = image.metadata
+        is_unnamed = not header.profile and header.tags.get(Base.ColorSpace) == _UNCALIBRATED
+        if is_unnamed or not is_usable(header.profile):
+            names.append(image.path.name)
     said = "colours are taken for sRGB, since the colour profile is missing, damaged or of another kind"
     return [f"{said}: {listed(names, _LISTED)}"] if names else []
 
@@ -269,12 +264,15 @@ def _check_samples(image: Opened, bits: int) -> None:
         return
     tags = image.tag_v2  # type: ignore[attr-defined]  # of TIFF only
     samples = int(tags.get(Base.SamplesPerPixel, 1))
-    if samples > 1 and tags.get(Base.PlanarConfiguration) == _SEPARATE:
-        raise ValueError("channels in separate planes")
-    if samples in (2, 4) and (kind := tags.get(Base.ExtraSamples, (_ALPHA,))[0]) in _OTHER_SAMPLES:
-        raise ValueError(_OTHER_SAMPLES[kind])
-    if bits == 16 and tags.get(Base.PhotometricInterpretation) == _WHITE_IS_ZERO:
-        raise ValueError("16 bits in which white is 0")
+    alpha = tags.get(Base.ExtraSamples, (_STRAIGHT_ALPHA,))[0]
+    refused = {
+        "channels in separate planes": samples > 1 and tags.get(Base.PlanarConfiguration) == _SEPARATE,
+        "a last channel that is not straight alpha": samples in (2, 4) and alpha != _STRAIGHT_ALPHA,
+        "16 bits in which white is 0": bits == 16 and tags.get(Base.PhotometricInterpretation) == 0,
+    }
+    for what, is_so in refused.items():
+        if is_so:
+            raise ValueError(what)
 
 
 def _profile(image: Opened, cicp: bytes, tags: dict[int, Any]) -> Profile:

@@ -1,4 +1,4 @@
-"""`load_scene`: one function for all layouts, and the one place where a scene is built."""
+"""`load_scene`: one function for all layouts, and the one place where a folder becomes a scene."""
 
 import math
 from collections import Counter
@@ -12,6 +12,7 @@ from typing import Self
 import kornia.geometry as kg
 import numpy as np
 import torch
+from PIL.ExifTags import Base
 from torch import Tensor
 
 from kgs._support.default_device import on_cpu
@@ -23,8 +24,7 @@ from .folders import CAMERAS_REPORT
 from .frames import LARGEST, SMALLEST, Frame, FrameSet
 from .image_file import color_notes
 from .images import rectification, remap, resize
-from .mask_files import find_mask_files
-from .masks import as_masks
+from .masks import find_masks
 from .options import BACKGROUNDS, check_options
 from .scene import Scene, Views
 from .source import SceneSource
@@ -39,8 +39,7 @@ _CLOCKWISE = torch.tensor(
     device="cpu",
 )
 _VALID = 0.99  # share of a pixel that a mask keeps, above which it counts
-_ORIENTATION = 0x112  # a tag of Exif
-_SIDEWAYS = (5, 6, 7, 8)  # its values for photos that a quarter turn makes upright
+_SIDEWAYS = (5, 6, 7, 8)  # Exif's orientations of photos that a quarter turn makes upright
 _FINE_PIXELS = 1_000_000  # of an image for the initial points: twice the width and height halves the error of depths
 
 
@@ -125,7 +124,8 @@ def load_scene(
             expected = f"cameras in one place, or at least {SMALLEST:g} apart"
             raise DataError(root, "poses", expected, f"{spread:.2g}", advice="scale poses and points up")
         offset = centers.mean(dim=0)  # float64; without the test views
-        first = _usual(train)
+        lying = [frame.intrinsics.width >= frame.intrinsics.height for frame in train]
+        first = train[lying.index(2 * sum(lying) >= len(lying))]  # of the kind, upright or lying, that most are
         scales = [_Scale.of(first, downscale or 1.0)]
         height, width = scales[0].size
         fine_downscale = max(1.0, (downscale or 1.0) * math.sqrt(height * width / _FINE_PIXELS))
@@ -160,10 +160,9 @@ def _with_masks(root: Path, frame_set: FrameSet, folder: Path | None) -> FrameSe
     if folder is None and any(frame.mask for frames in parts for frame in frames):
         return frame_set
     photos = [frame.path for frames in parts for frame in frames]
-    files = find_mask_files(photos, root, folder)
-    found = as_masks(files)
-    notes = (*frame_set.notes, *files.notes(root, _LISTED))
-    frames, test = ([replace(frame, mask=found.get(frame.path)) for frame in frames] for frames in parts)
+    masks = find_masks(photos, root, folder)
+    notes = (*frame_set.notes, *masks.notes(root, _LISTED))
+    frames, test = ([replace(frame, mask=masks.of(frame.path)) for frame in frames] for frames in parts)
     return replace(frame_set, frames=frames, test=None if frame_set.test is None else test, notes=notes)
 
 
@@ -211,12 +210,6 @@ def _split(
     return [frames[i] for i in chosen], test_frames
 
 
-def _usual(frames: Sequence[Frame]) -> Frame:
-    """The first frame of the kind, upright or lying, that most frames are."""
-    lying = [frame.intrinsics.width >= frame.intrinsics.height for frame in frames]
-    return frames[lying.index(2 * sum(lying) >= len(lying))]
-
-
 @dataclass(frozen=True)
 class _Scale:
     """By how much all photos are reduced, and the size that results."""
@@ -243,7 +236,7 @@ def _check_size(frame: Frame, width: int, height: int, scales: Sequence[_Scale])
     if not lens.same_aspect(width, height):
         described = f"the {lens.width}x{lens.height} that {frame.source.name} describes"
         advice = ""
-        if lens.same_aspect(height, width) and frame.image.metadata.tags.get(_ORIENTATION) in _SIDEWAYS:
+        if lens.same_aspect(height, width) and frame.image.metadata.tags.get(Base.Orientation) in _SIDEWAYS:
             advice = "its Exif turns it by a quarter, and cameras have to be those of the photo as it is stored"
         got = f"{width}x{height} pixels"
         raise DataError(frame.path, "", f"a scaled version of {described}", got, advice=advice)
@@ -251,12 +244,6 @@ def _check_size(frame: Frame, width: int, height: int, scales: Sequence[_Scale])
         size = _reduced(width, height, scale.factor)
         if scale.size not in (size, size[::-1]):
             raise DataError(frame.path, "", f"{scale.first} pixels as the other images", f"{width}x{height}")
-
-
-def _is_turned(width: int, height: int, scale: _Scale) -> bool:
-    """Whether a photo has to be turned by a quarter to have the size of a scale."""
-    size = _reduced(width, height, scale.factor)
-    return size != scale.size and size == scale.size[::-1]
 
 
 def _views(
@@ -291,7 +278,7 @@ def _views(
         kept = None
         if image is not None:
             if frame.mask is not None:
-                kept = frame.mask.read(frame.path, width, height)
+                kept = frame.mask.kept(frame.path, width, height)
             if kept is not None and transparent:
                 alpha = kept[..., None] * (image[..., 3:] if image.shape[2] == 4 else 1.0)
                 image = np.concatenate([image[..., :3], alpha], axis=2)
@@ -301,7 +288,7 @@ def _views(
                 image[..., :3] = image[..., :3] * alpha + background.numpy() * (1 - alpha)
             image = remap(image, maps, kept)
             kept = None if kept is None else remap(kept, maps)
-        turned[i] = _is_turned(width, height, scales[0])
+        turned[i] = _reduced(width, height, scales[0].factor) != scales[0].size  # it is that size on its side
         if turned[i]:
             lens = lens.turned()
             image = None if image is None else np.ascontiguousarray(np.rot90(image, -1))

@@ -4,18 +4,17 @@ Loads neither NumPy nor torch before the files are read, so that the command rep
 """
 
 from dataclasses import replace
+from importlib import import_module
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kgs._support.errors import DataError
 
-from .folders import layout_of, no_scene, unused_files
+from .folders import LAYOUTS, layout_of, no_scene, unused_files
 
 if TYPE_CHECKING:
     from .frames import FrameSet
-
-_WITH_SIZES = ("LLFF", "COLMAP")  # layouts that have the same photos in several sizes
 
 
 class SceneSource:
@@ -45,7 +44,7 @@ class SceneSource:
     @property
     def has_sizes(self) -> bool:
         """Whether the layout can have its photos in several sizes, a folder for each."""
-        return self.layout in _WITH_SIZES
+        return LAYOUTS[self.layout].has_sizes
 
     def photo_size(self, photo_folder: str = "") -> tuple[int, int]:
         """Width and height of the first photo, which are those of all or turned; errors as of :meth:`frames`."""
@@ -65,10 +64,9 @@ class SceneSource:
         return self._frames[photo_folder]
 
     def _read(self, photo_folder: str) -> "FrameSet":
-        from .layouts import READERS
-
         if photo_folder and not self.has_sizes:
             expected = f"a scene with several folders of photos for {photo_folder}"
             raise DataError(self.root, "", expected, self.layout)
-        frames = READERS[self.layout](self.root, *([photo_folder] if self.has_sizes else []))
+        reader = import_module(f"kgs.datasets.layouts.{self.layout.lower()}")
+        frames: FrameSet = reader.load(self.root, *([photo_folder] if self.has_sizes else []))
         return replace(frames, notes=(*frames.notes, *unused_files(self.root, self.layout)))

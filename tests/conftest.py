@@ -35,7 +35,7 @@ settings.load_profile("kgs")
 # ones, so that no worker ends long before the other.
 _FIRST = [
     "test_resume",
-    *("test_kernels_projection", "test_synthetic", "test_house", "test_synthetic_room", "test_api", "test_wheel"),
+    *("test_kernels_projection", "test_synthetic", "test_house", "test_api", "test_wheel"),
     *("test_kernels_loss", "test_load", "test_transforms", "test_colmap", "test_page_browser", "test_trainer"),
     *("test_cli", "test_fit_folder", "test_init_points_dense", "test_kernels_compositing", "test_not_finite"),
     *("test_gpu_fit", "test_bits", "test_extreme_cases", "test_cli_process", "test_run", "test_sfm_folders"),

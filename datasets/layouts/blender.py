@@ -17,7 +17,7 @@ _RANDOM_POINTS = 10_000
 _TEST_FILE = "transforms_test.json"
 
 
-def load_blender(root: Path) -> FrameSet:
+def load(root: Path) -> FrameSet:
     """Read the two JSON files of a scene in the layout of NeRF's, see :func:`read_transforms`.
 
     All frames of the test file whose pictures exist are test views; without such frames or such a file, test views are

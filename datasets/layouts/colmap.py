@@ -3,6 +3,7 @@
 Source: https://colmap.github.io/cameras.html.
 """
 
+from contextlib import suppress
 from pathlib import Path
 
 import torch
@@ -19,7 +20,7 @@ from .colmap_poses import registered_images
 _LISTED = 20
 
 
-def load_colmap(root: Path, photo_folder: str = "") -> FrameSet:
+def load(root: Path, photo_folder: str = "") -> FrameSet:
     """Read the COLMAP model of a scene, of several the largest one.
 
     Photos that are gone are left out with a note, unless more than half of them are.
@@ -58,20 +59,15 @@ def largest_model(root: Path) -> tuple[Path, tuple[str, ...]]:
     folders = find_models(root)
     if len(folders) == 1:
         return folders[0], ()
-    counts = {folder: _image_count(folder) for folder in folders}
+    counts = dict.fromkeys(folders, 0)
+    for folder in folders:
+        with suppress(DataError):  # a damaged one
+            counts[folder] = len(read_images(model_file(folder, "images")))
     largest = max(folders, key=counts.__getitem__)
     others = [f"{folder.relative_to(root)} has {counts[folder]}" for folder in folders if folder != largest]
     name = largest.relative_to(root)
     note = f"{name} is the COLMAP model that is read, with {counts[largest]} images: {', '.join(others[:_LISTED])}"
     return largest, (note,)
-
-
-def _image_count(folder: Path) -> int:
-    """How many images a model has; 0 if it is damaged."""
-    try:
-        return len(read_images(model_file(folder, "images")))
-    except DataError:
-        return 0
 
 
 def track_points(folder: Path, image_ids: set[int]) -> PointCloud:

@@ -7,8 +7,7 @@ checked against the file's length before memory is allocated for it.
 import re
 import struct
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
-from itertools import islice
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -80,42 +79,22 @@ def model_file(folder: Path, stem: str) -> Path:
 def read_cameras(path: Path) -> dict[int, ColmapCamera]:
     """Read cameras.bin or cameras.txt; damage, a repeated id or a model without undistortion is a DataError."""
     cameras: dict[int, ColmapCamera] = {}
-    if path.suffix == ".bin":
-        data = _Binary(path)
-        for _ in data.items("number of cameras", 24):
-            camera_id, model_id, width, height = data.take("<IiQQ", "camera")
-            model = dict(enumerate(_MODELS)).get(model_id, f"number {model_id}")
-            params = data.take(f"<{_parameter_count(path, camera_id, model)}d", f"camera {camera_id}")
-            _add(path, "camera", cameras, camera_id, ColmapCamera(model, width, height, params))
-    else:
-        for line in filter(None, _lines(path)):
-            kinds = (int, str, int, int, partial(_numbers, float))
-            camera_id, model, width, height, params = _fields(path, line, kinds)
-            if len(params) != (count := _parameter_count(path, camera_id, model)):
-                raise DataError(path, f"camera {camera_id}", f"{count} parameters of {model}", len(params))
-            _add(path, "camera", cameras, camera_id, ColmapCamera(model, width, height, params))
+    for record in _records(path, "number of cameras", 24):
+        camera_id, model, width, height = record.take("<IlQQ", "camera")
+        name = model if isinstance(model, str) else dict(enumerate(_MODELS)).get(model, f"number {model}")
+        params = record.take(f"<{_parameter_count(path, camera_id, name)}d", f"camera {camera_id}")
+        _add(path, "camera", cameras, camera_id, ColmapCamera(name, width, height, params))
     return cameras
 
 
 def read_images(path: Path) -> dict[int, ColmapImage]:
     """Read images.bin or images.txt without the 2D observations; damage or a repeated id is a DataError."""
     images: dict[int, ColmapImage] = {}
-    if path.suffix == ".bin":
-        data = _Binary(path)
-        for _ in data.items("number of images", 73):
-            image_id, *pose, camera_id = data.take("<I7dI", "image")
-            name = data.string(f"image {image_id}")
-            data.take(f"{24 * data.count(f'observations of {name}', 24)}x", "observations")  # skipped
-            _add(path, "image", images, image_id, ColmapImage(_pose(pose), camera_id, name))
-    else:
-        may_be_observations = False
-        for line in _lines(path):
-            if not line or (may_be_observations and _is_observations(line)):
-                may_be_observations = False  # an image's second line may be empty, or left out
-                continue
-            image_id, *pose, camera_id, name = _fields(path, line, (int, *[float] * 7, int, str))
-            _add(path, "image", images, image_id, ColmapImage(_pose(pose), camera_id, name))
-            may_be_observations = True
+    for record in _records(path, "number of images", 73):
+        image_id, *pose, camera_id = record.take("<I7dI", "image")
+        name = record.string(f"image {image_id}")
+        record.skip_observations(name)
+        _add(path, "image", images, image_id, ColmapImage(_pose(pose), camera_id, name))
     return images
 
 
@@ -162,7 +141,9 @@ def read_points(path: Path, image_ids: set[int]) -> tuple[NDArray[np.float64], N
     rows = []
     count = 0
     without_track = 0
-    for row, track in _tracks(path):
+    for record in _records(path, "number of points", 51):
+        _, *row, _ = record.take("<Q3d3Bd", "point")
+        track = record.track()
         count += 1
         without_track += not track
         if len(image_ids.intersection(track[::2])) >= 2:
@@ -178,19 +159,6 @@ def read_points(path: Path, image_ids: set[int]) -> tuple[NDArray[np.float64], N
     if not 0 <= min(colors, default=0) <= max(colors, default=0) <= 255:  # integers in a text file have no limit
         raise DataError(path, "", "colours from 0 to 255", f"{min(colors)} to {max(colors)}"[:200])
     return points, np.array([row[3:] for row in rows], np.uint8).reshape(-1, 3)
-
-
-def _tracks(path: Path) -> Iterator[tuple[list[Any], tuple[int, ...]]]:
-    """Position and colour of each point, and its track: pairs of an image's id and an observation's number."""
-    if path.suffix == ".bin":
-        data = _Binary(path)
-        for _ in data.items("number of points", 51):
-            _, *row, _ = data.take("<Q3d3Bd", "point")
-            yield row, data.take(f"<{2 * data.count('track', 8)}I", "track")
-    else:
-        for line in filter(None, _lines(path)):
-            _, *row, _, track = _fields(path, line, (int, *[float] * 3, *[int] * 3, float, partial(_numbers, int)))
-            yield row, track
 
 
 class _Binary:
@@ -230,40 +198,64 @@ class _Binary:
         except UnicodeDecodeError as error:
             raise DataError(self._path, what, "a name in UTF-8", quoted(text)) from error
 
+    def skip_observations(self, name: str) -> None:
+        self.take(f"{24 * self.count(f'observations of {name}', 24)}x", "observations")
+
+    def track(self) -> tuple[int, ...]:
+        """Pairs of an image's id and an observation's number."""
+        return self.take(f"<{2 * self.count('track', 8)}I", "track")
+
     def _need(self, size: int, what: str) -> None:
         if size > (left := len(self._data) - self._at):
             raise DataError(self._path, what, f"{size} bytes at byte {self._at}", left)
 
 
-def _kind(word: str) -> int:
-    """The number of a kind of sensor, -1 for all that are no cameras."""
-    return _CAMERA if word == "CAMERA" else -1
-
-
-# What words of a text stand for, by the code that their numbers have in a binary file.
-_WORDS: dict[str, Callable[[str], Any]] = {"i": _kind, "I": int, "Q": int, "B": int, "d": float}
+# What words of a text stand for, by the code that their numbers have in a binary file. Of a camera's model it is "l".
+_WORDS: dict[str, Callable[[str], Any]] = {
+    "i": lambda word: _CAMERA if word == "CAMERA" else -1,
+    "l": str,
+    **dict.fromkeys("IQB", int),
+    "d": float,
+}
 
 
 class _Line:
-    """A line of a text model, whose words are read in order as `_Binary` reads numbers."""
+    """A line of a text model, which is read as `_Binary` is."""
 
     def __init__(self, path: Path, line: str) -> None:
         self._path = path
         self._line = line
-        self._words = iter(line.split())
+        self._left = line
 
     def take(self, form: str, what: str) -> tuple[Any, ...]:
-        codes = "".join(code * int(count or 1) for count, code in re.findall(r"(\d*)([a-zA-Z])", form))
-        words = list(islice(self._words, len(codes)))
+        codes = _codes(form)
+        *words, self._left = [*self._left.split(maxsplit=len(codes)), ""][: len(codes) + 1]
         try:
             return tuple(_WORDS[code](word) for code, word in zip(codes, words, strict=True))
         except ValueError as error:
             raise DataError(self._path, what, "a line as COLMAP writes it", quoted(self._line)) from error
 
+    def string(self, _: str) -> str:
+        text, self._left = self._left, ""
+        return text
+
+    def skip_observations(self, name: str) -> None:
+        """They are in another line."""
+
+    def track(self) -> tuple[int, ...]:
+        return self.take(f"{len(self._left.split())}I", "track")
+
     def end(self) -> None:
         """The line has to end here."""
-        if left := list(self._words):
-            raise DataError(self._path, f"line {quoted(self._line)}", "its end", quantity(len(left), "more word"))
+        if self._left:
+            more = quantity(len(self._left.split()), "more word")
+            raise DataError(self._path, f"line {quoted(self._line)}", "its end", more)
+
+
+@cache
+def _codes(form: str) -> str:
+    """The code of each number of a struct's format."""
+    return "".join(code * int(count or 1) for count, code in re.findall(r"(\d*)([a-zA-Z])", form))
 
 
 def _records(path: Path, what: str, min_bytes: int) -> Iterator[_Binary | _Line]:
@@ -273,7 +265,7 @@ def _records(path: Path, what: str, min_bytes: int) -> Iterator[_Binary | _Line]
         for _ in data.items(what, min_bytes):
             yield data
     else:
-        for text in filter(None, _lines(path)):
+        for text in _lines(path):
             line = _Line(path, text)
             yield line
             line.end()
@@ -285,25 +277,19 @@ def _pose(numbers: Sequence[float]) -> ColmapPose:
 
 
 def _lines(path: Path) -> Iterator[str]:
-    """The lines of a text model without its comments, stripped; empty ones included."""
+    """The lines of a text model, stripped, without comments, empty lines and the observations of images."""
     try:
         text = read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise DataError(path, "", "text in UTF-8") from error
-    return (line.strip() for line in text.split("\n") if not line.startswith("#"))
-
-
-def _fields(path: Path, line: str, kinds: Sequence[Callable[[str], Any]]) -> list[Any]:
-    """The words of a line, converted; the last kind gets all that is left, which may be nothing."""
-    words = line.split(maxsplit=len(kinds) - 1)
-    try:
-        return [kind(word) for kind, word in zip(kinds, (*words, "")[: len(kinds)], strict=True)]
-    except ValueError as error:
-        raise DataError(path, f"line {quoted(line)}", f"{len(kinds)} fields as COLMAP writes them") from error
-
-
-def _numbers(kind: type[T], text: str) -> tuple[T, ...]:
-    return tuple(map(kind, text.split()))
+    is_image = False  # whether the line before is an image's; its second line may be empty, or left out
+    for line in text.split("\n"):
+        if line.startswith("#"):
+            continue
+        is_skipped = not line.strip() or (is_image and _is_observations(line))
+        is_image = path.stem == "images" and not is_skipped
+        if not is_skipped:
+            yield line.strip()
 
 
 def _is_observations(line: str) -> bool:

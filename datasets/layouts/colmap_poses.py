@@ -18,7 +18,7 @@ from .colmap_model import STEMS, ColmapImage, ColmapPose, model_file, read_frame
 
 _PARTS = ("frames", "rigs")  # that newer versions add to a model
 _OTHER = {".bin": ".txt", ".txt": ".bin"}
-_SAME = 1e-5  # relative; half of float32's digits
+_SAME = 1e-5  # relative: half of float32's digits. What poses differ by less, of the rotation or the way, is rounding.
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,40 +45,33 @@ def registered_images(folder: Path) -> Registered:
     images = read_images(source)
     own = _matrices(source, [(image.name, image.pose) for image in images.values()])
     poses = own
-    notes = _unused_copies(source)
+    copies = [source.with_stem(stem).with_suffix(_OTHER[source.suffix]) for stem in (*STEMS, *_PARTS)]
+    copies = [path for path in copies if path.is_file()]
+    unused = [path.name for path in copies if path.stem in _PARTS or path != model_file(path.parent, path.stem)]
+    notes: tuple[str, ...] = (f"not used: {', '.join(unused)}; the model is read from {source.name}",) if unused else ()
     parts = [source.with_stem(stem) for stem in _PARTS]
     given = [part for part in parts if part.is_file()]
     if len(given) == 1:
         (missing,) = (part.name for part in parts if part not in given)
         notes += (f"{given[0].name} is not used: there is no {missing} beside it",)
     elif given and images and (found := _poses_of_frames(images, *parts)) is not None:
-        poses, other_cameras, gone = found
+        poses, gone = found
         if gone:
             notes += (f"photos of {parts[0].name} that {source.name} lacks are left out: {gone}",)
-        if other_cameras:
-            which = f"{other_cameras} of {len(images)} photos have another camera than in {source.name}"
-            notes += (f"{parts[0].name} is not used for lenses: {which}; COLMAP does not read such a model",)
-        if differing := _count_differing(own, poses):
+        limit = torch.full((4, 4), _SAME, dtype=torch.float64)
+        limit[:3, 3] *= poses[:, :3, 3].abs().max()
+        if differing := int(((own - poses).abs() > limit).any(dim=2).any(dim=1).sum()):
             which = f"the poses of {differing} of {len(images)} photos in {source.name} are not used"
             notes += (f"{which}: {parts[0].name} and {parts[1].name} give others, which COLMAP takes",)
     return Registered(images, kg.inverse_transformation(poses), kg.inverse_transformation(own), notes)
 
 
-def _unused_copies(source: Path) -> tuple[str, ...]:
-    """A note where files of the model are there in the other format than the images that are read, too."""
-    copies = [source.with_stem(stem).with_suffix(_OTHER[source.suffix]) for stem in (*STEMS, *_PARTS)]
-    copies = [path for path in copies if path.is_file()]
-    unused = [path.name for path in copies if path.stem in _PARTS or path != model_file(path.parent, path.stem)]
-    return (f"not used: {', '.join(unused)}; the model is read from {source.name}",) if unused else ()
-
-
 def _poses_of_frames(
     images: Mapping[int, ColmapImage], frames_file: Path, rigs_file: Path
-) -> tuple[Tensor, int, int] | None:
-    """The poses from world to camera by the frames and rigs; how many photos have another camera than in images.*.
+) -> tuple[Tensor, int] | None:
+    """The poses from world to camera by the frames and rigs, and how many photos of the frames images.* lacks.
 
-    The last number counts photos of the frames that images.* lacks. None where both files are empty: COLMAP then takes
-    the poses in images.*.
+    None where both files are empty: COLMAP then takes the poses in images.*.
     """
     frames = read_frames(frames_file)
     rigs = read_rigs(rigs_file)
@@ -86,7 +79,6 @@ def _poses_of_frames(
         return None
     rig_poses: dict[int, tuple[str, ColmapPose]] = {}  # by image: of the rig from the world, of the camera from the rig
     camera_poses: dict[int, tuple[str, ColmapPose]] = {}
-    other_cameras = 0
     gone = 0
     for frame_id, frame in frames.items():
         if frame.rig_id not in rigs:
@@ -98,17 +90,18 @@ def _poses_of_frames(
             name = images[image_id].name
             if image_id in rig_poses:
                 raise DataError(frames_file, name, "each image in one frame", "it in two")
+            if camera_id != images[image_id].camera_id:
+                raise DataError(frames_file, name, f"camera {images[image_id].camera_id} as in images.*", camera_id)
             if (pose := rigs[frame.rig_id].get(camera_id)) is None:
                 raise DataError(rigs_file, name, f"the pose of camera {camera_id} in rig {frame.rig_id}", "none")
             rig_poses[image_id] = (f"frame {frame_id}", frame.pose)
             camera_poses[image_id] = (f"rig {frame.rig_id}", pose)
-            other_cameras += camera_id != images[image_id].camera_id
     if lacking := [image.name for image_id, image in images.items() if image_id not in rig_poses]:
         advice = f"where the poses in images.* are right, remove {frames_file.name} and {rigs_file.name}"
         raise DataError(frames_file, lacking[0], "each image in a frame", f"{len(lacking)} in none", advice=advice)
     camera_from_rig = _matrices(rigs_file, [camera_poses[image_id] for image_id in images])
     rig_from_world = _matrices(frames_file, [rig_poses[image_id] for image_id in images])
-    return camera_from_rig @ rig_from_world, other_cameras, gone
+    return camera_from_rig @ rig_from_world, gone
 
 
 def _matrices(source: Path, poses: Sequence[tuple[str, ColmapPose]]) -> Tensor:
@@ -123,10 +116,3 @@ def _matrices(source: Path, poses: Sequence[tuple[str, ColmapPose]]) -> Tensor:
         if not is_valid:
             raise DataError(source, what, "a finite 4x4 pose")
     return matrices
-
-
-def _count_differing(poses: Tensor, others: Tensor) -> int:
-    """How many poses differ by more than rounding, of the rotation or of the largest translation."""
-    limit = torch.full((4, 4), _SAME, dtype=torch.float64)
-    limit[:3, 3] *= others[:, :3, 3].abs().max()
-    return int(((poses - others).abs() > limit).any(dim=2).any(dim=1).sum())

@@ -18,7 +18,7 @@ from .colmap import largest_model, track_points
 from .colmap_poses import registered_images
 
 
-def load_llff(root: Path, photo_folder: str = "") -> FrameSet:
+def load(root: Path, photo_folder: str = "") -> FrameSet:
     """Read `poses_bounds.npy`, one row per image in the order of the names in `images/` or else `images_k/`.
 
     Convention:

@@ -6,7 +6,7 @@ Sources: https://docs.nerf.studio/quickstart/data_conventions.html; instant-ngp'
 import math
 import re
 from collections import ChainMap
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, MutableMapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -22,8 +22,7 @@ from kgs.datasets.image_file import ImageFile
 from kgs.datasets.images import Intrinsics
 from kgs.datasets.masks import Mask
 
-Object = dict[str, Any]
-Values = ChainMap[str, Any]  # what holds for a frame: its own entries, then those of the whole file
+Object = MutableMapping[str, Any]
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 _FISHEYE = "OPENCV_FISHEYE"
 # The distortion coefficients of Brown-Conrady and of Kannala-Brandt lenses, in OpenCV's order.
@@ -54,7 +53,7 @@ _GEOMETRY = re.compile(
 )
 
 
-def load_nerfstudio(root: Path) -> FrameSet:
+def load(root: Path) -> FrameSet:
     """Read `transforms.json`, see :func:`read_transforms`.
 
     `applied_transform` is not undone: the world is the file's. Where the file has `test_filenames` (or else
@@ -102,44 +101,50 @@ def read_transforms(root: Path, name: str) -> tuple[list[Frame], Object, tuple[s
         raise DataError(source, "frames", "a list of objects, not empty")
     split = {f"{part}_filenames" for part in ("train", "val", "test")} if name == "transforms.json" else set[str]()
     top = {key: data[key] for key in data.keys() - split}
-    notes = _check_keys(source, [ChainMap(top), *(ChainMap(entry, data) for entry in entries)])
-    names = [_find_photo(source, root, _text(source, "file_path", entry, None)) for entry in entries]
+    values = [_Values(source, entry, data) for entry in entries]
+    notes = _check_keys(source, [_Values(source, top), *values])
+    names = [_find_photo(source, root, _Values(source, entry).text("file_path")) for entry in entries]
     images = [ImageFile(find_file(source, root, name)) for name in names]
-    size = (1, 1)
-    if not all("w" in values and "h" in values for values in (ChainMap(entry, data) for entry in entries)):
-        size = _first_size(images)
-    frames = [
-        Frame(
-            source,
-            name,
-            image,
-            _lens(source, ChainMap(entry, data), size),
-            _opencv_pose(source, entry),
-            _mask(source, root, ChainMap(entry, data)),
-        )
-        for name, image, entry in zip(names, images, entries, strict=True)
-    ]
+    size = (1, 1)  # where no photo is there `load_scene` refuses the scene
+    if not all("w" in of_frame and "h" in of_frame for of_frame in values):
+        for image in (image for image in images if image.path.is_file()):
+            image.load()  # its pixels will be decoded later: the file is not opened again for them
+            size = image.size
+            break
+    frames = []
+    for name, image, of_frame in zip(names, images, values, strict=True):
+        lens = _lens(of_frame, size)
+        mask = of_frame.text("mask_path", "")
+        if mask and not (path := find_file(source, root, mask)).is_file():
+            raise of_frame.wrong("mask_path", "a file", f"{mask[:200]!r}, which is not there")
+        pose = _opencv_pose(source, of_frame.maps[0])
+        frames.append(Frame(source, name, image, lens, pose, Mask(path) if mask else None))
     return frames, data, notes
 
 
-def _mask(source: Path, root: Path, values: Values) -> Mask | None:
-    """The mask that `mask_path` names, of a frame or of all."""
-    name = _text(source, "mask_path", values, "")
-    if not name:
-        return None
-    path = find_file(source, root, name)
-    if not path.is_file():
-        raise DataError(source, _field("mask_path", values), "a file", f"{name[:200]!r}, which is not there")
-    return Mask(ImageFile(path))
+class _Values(ChainMap[str, Any]):
+    """What holds for a frame: its own entries, then those of the whole file."""
 
+    def __init__(self, source: Path, *objects: Object) -> None:
+        super().__init__(*objects)
+        self.source = source
 
-def _first_size(images: list[ImageFile]) -> tuple[int, int]:
-    """Width and height of the first image that exists; 1x1 if none does, which `load_scene` refuses."""
-    for image in images:
-        if image.path.is_file():
-            image.load()  # its pixels will be decoded later: the file is not opened again for them
-            return image.size
-    return 1, 1
+    def number(self, key: str, default: float | None = None) -> float:
+        if not is_number(value := self.get(key, default)):
+            raise self.wrong(key, "a finite number", _shown(value))
+        return float(value)
+
+    def text(self, key: str, default: str | None = None) -> str:
+        if not isinstance(value := self.get(key, default), str):
+            raise self.wrong(key, "a text", _shown(value))
+        return value
+
+    def wrong(self, key: str, expected: str, got: object) -> DataError:
+        """The error about an entry, which names the photo of the frame unless it holds for all."""
+        own = self.maps[0]
+        name = own.get("file_path")
+        of_photo = f" of {name[:200]}" if key in own and key != "file_path" and isinstance(name, str) else ""
+        return DataError(self.source, f"{key[:60]}{of_photo}", expected, got)
 
 
 def _find_photo(source: Path, root: Path, name: str) -> str:
@@ -150,103 +155,81 @@ def _find_photo(source: Path, root: Path, name: str) -> str:
     return next((candidate for candidate in candidates if path_inside(source, root, candidate).is_file()), otherwise)
 
 
-def _check_keys(source: Path, objects: Iterable[Values]) -> tuple[str, ...]:
+def _check_keys(source: Path, objects: Iterable[_Values]) -> tuple[str, ...]:
     """Refuse unknown keys that bear on lenses or poses; returns a note about the other unknown keys."""
     known = set(_KNOWN.split())
     unused = set()
     for values in objects:
         for key, value in values.maps[0].items():
-            if key in known or _is_empty(value) or _is_harmless(key, value, values):
+            if key in known or _is_empty(value):
+                continue
+            if key in _DESCRIPTIONS and isinstance(value, str) and not _OTHER_LENS.search(value):
+                continue
+            if key in _SIZES and is_number(value) and value == values.get(_SIZES[key]):
                 continue
             if _GEOMETRY.search(key) or key.endswith("_filenames"):
-                raise DataError(source, _field(key, values), "none, 0 or false, kgs cannot use it", _shown(value))
+                raise values.wrong(key, "none, 0 or false, kgs cannot use it", _shown(value))
             unused.add(key[:60])
     return (f"{source.name}: not used: {', '.join(sorted(unused)[:20])}",) if unused else ()
-
-
-def _is_harmless(key: str, value: Any, values: Values) -> bool:
-    """Whether a key only repeats or describes what other keys say of the camera."""
-    if key in _DESCRIPTIONS:
-        return isinstance(value, str) and not _OTHER_LENS.search(value)
-    return key in _SIZES and is_number(value) and value == values.get(_SIZES[key])
 
 
 def _is_empty(value: Any) -> bool:
     return all(map(_is_empty, value)) if isinstance(value, list) else not value
 
 
-def _lens(source: Path, values: Values, size: tuple[int, ...]) -> Intrinsics:
+def _lens(values: _Values, size: tuple[int, ...]) -> Intrinsics:
     """A frame's lens; `size` is the image size if the file does not give it."""
-    fisheye = _is_fisheye(source, values)
-    width = _number(source, "w", values, size[0])
-    height = _number(source, "h", values, size[1])
+    fisheye = _is_fisheye(values)
+    width = values.number("w", size[0])
+    height = values.number("h", size[1])
     if not (width.is_integer() and height.is_integer()):
-        raise DataError(source, "w, h", "whole numbers of pixels", f"{width:g} and {height:g}")
-    fx = _focal(source, "x", values, width)
-    fy = _focal(source, "y", values, height)
+        raise DataError(values.source, "w, h", "whole numbers of pixels", f"{width:g} and {height:g}")
+    fx = _focal("x", values, width)
+    fy = _focal("y", values, height)
     fx = fy if fx is None else fx
     fy = fx if fy is None else fy
     if fx is None or fy is None:
-        raise DataError(source, "fl_x, camera_angle_x", "one of them", "none")
+        raise DataError(values.source, "fl_x, camera_angle_x", "one of them", "none")
     used = _KANNALA if fisheye else _BROWN
     frame = values.maps[0]
-    of_this_lens = frame if {"camera_model", "is_fisheye"} & frame.keys() else values
+    of_this_lens = _Values(values.source, frame) if {"camera_model", "is_fisheye"} & frame.keys() else values
     for key in _COEFFICIENTS:
-        if key not in used and (value := _number(source, key, of_this_lens, 0.0)) != 0:
+        if key not in used and (value := of_this_lens.number(key, 0.0)) != 0:
             kind = "a fisheye lens" if fisheye else "a lens that is not a fisheye, where tools disagree on its meaning"
-            raise DataError(source, _field(key, values), f"0 for {kind}", f"{value:g}")
-    distortion = tuple(_number(source, key, values, 0.0) for key in used)
-    cx = _number(source, "cx", values, width / 2)
-    cy = _number(source, "cy", values, height / 2)
+            raise values.wrong(key, f"0 for {kind}", f"{value:g}")
+    distortion = tuple(values.number(key, 0.0) for key in used)
+    cx = values.number("cx", width / 2)
+    cy = values.number("cy", height / 2)
     return Intrinsics(int(width), int(height), fx, fy, cx, cy, distortion, fisheye)
 
 
-def _is_fisheye(source: Path, values: Values) -> bool:
+def _is_fisheye(values: _Values) -> bool:
     """Whether the lens is a fisheye: nerfstudio names the model in `camera_model`, instant-ngp has `is_fisheye`."""
-    model = _text(source, "camera_model", values, "")
+    model = values.text("camera_model", "")
     flag = values.get("is_fisheye")
     known = (*_PERSPECTIVE, _FISHEYE)
     if "camera_make" in values and model not in known and not _OTHER_LENS.search(model):
         model = ""  # of the device, as in Exif
     if model not in ("", *known):
-        raise DataError(source, _field("camera_model", values), f"one of {', '.join(known)}", quoted(model))
+        raise values.wrong("camera_model", f"one of {', '.join(known)}", quoted(model))
     if flag is not None and not (isinstance(flag, int) and flag in (0, 1)):
-        raise DataError(source, _field("is_fisheye", values), "true or false", _shown(flag))
+        raise values.wrong("is_fisheye", "true or false", _shown(flag))
     if flag is not None and model and bool(flag) != (model == _FISHEYE):
-        raise DataError(source, _field("is_fisheye", values), f"that of camera_model, {model}", str(bool(flag)).lower())
+        raise values.wrong("is_fisheye", f"that of camera_model, {model}", str(bool(flag)).lower())
     return bool(flag) or model == _FISHEYE
 
 
-def _focal(source: Path, axis: str, values: Values, length: float) -> float | None:
+def _focal(axis: str, values: _Values, length: float) -> float | None:
     """The focal length in pixels along an axis, from `fl_` or else from the field of view over `length`; or None."""
     for item in values.maps:
         if f"fl_{axis}" in item:
-            return _number(source, f"fl_{axis}", item, None)
+            return values.number(f"fl_{axis}")
         if (key := f"camera_angle_{axis}") in item:
-            angle = _number(source, key, item, None)
+            angle = values.number(key)
             if not 0 < angle / 2 < math.pi / 2:
-                raise DataError(source, _field(key, item), "an angle between 0 and pi", f"{angle:g}")
+                raise values.wrong(key, "an angle between 0 and pi", f"{angle:g}")
             return length / (2 * math.tan(angle / 2))
     return None
-
-
-def _number(path: Path, key: str, values: Mapping[str, Any], default: float | None) -> float:
-    if not is_number(value := values.get(key, default)):
-        raise DataError(path, _field(key, values), "a finite number", _shown(value))
-    return float(value)
-
-
-def _text(path: Path, key: str, values: Mapping[str, Any], default: str | None) -> str:
-    if not isinstance(value := values.get(key, default), str):
-        raise DataError(path, _field(key, values), "a text", _shown(value))
-    return value
-
-
-def _field(key: str, values: Mapping[str, Any]) -> str:
-    """How an error names a key: with the photo of its frame, unless it holds for all frames."""
-    own = values.maps[0] if isinstance(values, ChainMap) else values
-    name = own.get("file_path")
-    return f"{key[:60]} of {name[:200]}" if key in own and key != "file_path" and isinstance(name, str) else key[:60]
 
 
 def _shown(value: Any) -> str:

@@ -81,7 +81,9 @@ def views_beyond(out: float, count: int = 6, size: tuple[int, int] = (126, 168),
     """
     if not 0.0 < out < np.inf or count < 1:
         raise ArgumentError("out, count", "a number > 0 and at least one camera", f"{out} and {count}")
-    return _views(_make_world(seed), room.EYE + out * _ellipse(count) * room.PATCH, size, "beyond")
+    turn = 2 * np.pi * np.arange(count) / count
+    circle = np.stack([np.cos(turn), np.sin(turn), np.zeros(count)], axis=-1)
+    return _views(_make_world(seed), room.EYE + out * circle * room.PATCH, size, "beyond")
 
 
 def synthetic_depths(cameras: PinholeCamera, seed: int = 0) -> Tensor:
@@ -157,12 +159,6 @@ def _patch_eyes(train: int, test: int, rng: np.random.Generator) -> tuple[Array,
     flat = np.concatenate([zigzag, 1.15 * (2.0 * spread - 1.0)])
     eyes = room.EYE + room.PATCH * np.concatenate([flat, rng.uniform(-1.0, 1.0, size=(train + test, 1))], axis=1)
     return eyes[:train], eyes[train:]
-
-
-def _ellipse(count: int) -> Array:
-    """Positions `(n, 3)` evenly spread over the unit circle in the plane z = 0, the first at the right."""
-    turn = 2 * np.pi * np.arange(count) / count
-    return np.stack([np.cos(turn), np.sin(turn), np.zeros(count)], axis=-1)
 
 
 def _look_at(eye: Array, target: Array) -> Array:

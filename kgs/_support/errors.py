@@ -122,4 +122,4 @@ class PhotosRefused(DataError):
 
 
 class TrainingDiverged(RuntimeError):
-    """A loss, gradient or parameter is no longer finite; raised before it can reach the optimiser's state."""
+    """A loss, gradient or parameter is no longer finite: on a CPU before it reaches a parameter, see `Trainer.fit`."""

@@ -1,7 +1,6 @@
 """Public names that a package loads on first use: `import kgs` takes milliseconds, and torch seconds."""
 
-import sys
-from importlib import import_module
+import lazy_loader
 
 TYPE_CHECKING = False  # type checkers take it as True; importing `typing` would cost more than all the rest here
 if TYPE_CHECKING:
@@ -9,32 +8,31 @@ if TYPE_CHECKING:
     from typing import Any
 
 
-def lazy_names(
-    package: str, homes: dict[str, tuple[str, ...]]
-) -> "tuple[Callable[[str], Any], Callable[[], list[str]]]":
-    """The functions `__getattr__` and `__dir__` of a package (PEP 562).
+def public_names(package: str, file: str) -> "tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]":
+    """`__getattr__`, `__dir__` and `__all__` of a package, from its stub `__init__.pyi`.
 
-    For type checkers the package imports the same names under `if TYPE_CHECKING`.
+    The stub is what type checkers read: public names are written there, and nowhere else (PEP 562; SPEC 1 of Scientific
+    Python).
 
     Args:
         package: its `__name__`.
-        homes: the public names of each module, by the full name of the module. Modules of the package itself are
-            attributes, too.
+        file: its `__file__`.
 
     Returns:
-        `__getattr__`, which imports a name's module and returns the name, and `__dir__`. Where a package of an extra
-        is missing, the ModuleNotFoundError names the extra.
+        Of these, `__getattr__` imports the module of a name, and returns the name. Where a package of an extra is
+        missing, the ModuleNotFoundError names the extra.
 
     Examples:
-        >>> __getattr__, __dir__ = lazy_names("kgs", {"kgs.drop": ("DropGaussian", "drop_gaussian")})
+        >>> import kgs
+        >>> __getattr__, __dir__, __all__ = public_names("kgs", kgs.__file__)
         >>> __getattr__("DropGaussian").__name__
         'DropGaussian'
     """
-    modules = {name: module for module, names in homes.items() for name in names}
+    load, names, public = lazy_loader.attach_stub(package, file)
 
-    def load(module: str) -> "Any":
+    def __getattr__(name: str) -> "Any":
         try:
-            return import_module(module)
+            return load(name)
         except ModuleNotFoundError as error:
             from .extras import missing
 
@@ -42,14 +40,4 @@ def lazy_names(
                 raise
             raise ModuleNotFoundError(missing(error.name or ""), name=error.name) from error
 
-    def __getattr__(name: str) -> "Any":
-        if name in modules:
-            return getattr(load(modules[name]), name)
-        if f"{package}.{name}" in homes:
-            return import_module(f"{package}.{name}")
-        raise AttributeError(f"module {package!r} has no attribute {name!r}")
-
-    def __dir__() -> list[str]:
-        return sorted({*vars(sys.modules[package]), *modules})
-
-    return __getattr__, __dir__
+    return __getattr__, names, public

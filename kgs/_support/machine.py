@@ -5,7 +5,6 @@ import os
 import platform
 import subprocess
 import sys
-from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -33,12 +32,6 @@ def device_name(device: torch.device) -> str:
     if device.type == "cpu":
         return f"CPU, {quantity(torch.get_num_threads(), 'core')}"
     return f"{torch.get_device_module(device).get_device_name(device)} ({device})"
-
-
-def check_packages(*packages: str) -> None:
-    """Raises if a package that a command needs is missing."""
-    for package in packages:
-        import_module(package)
 
 
 def versions() -> dict[str, str]:

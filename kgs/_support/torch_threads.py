@@ -1,7 +1,7 @@
 """How many threads torch's own operators use, where kernels do most of the work."""
 
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from threading import local
 
 import torch
@@ -31,11 +31,6 @@ def torch_on_one_thread() -> Iterator[None]:
     finally:
         torch.set_num_threads(before)
         _limits.kernels = outer
-
-
-def threads_beside(backend: str) -> AbstractContextManager[None]:
-    """For a fit with this backend: :func:`torch_on_one_thread` where kernels on a CPU do most of the work."""
-    return torch_on_one_thread() if backend == "numba" else nullcontext()
 
 
 @contextmanager

@@ -1,1 +1,1 @@
-"""The application on the library: the command `kgs`, folders of results, pages. No module outside it imports it."""
+"""The application on the library: the command `kgs`, folders of results, pages. Only `kgs.study` imports it."""

@@ -10,7 +10,7 @@ from kornia.geometry import camtoworld_vision_to_graphics_4x4
 from kgs._support.json_files import read_json, write_json
 from kgs.app.files.outputs import write_png
 from kgs.datasets import synthetic_scene
-from kgs.datasets.folders import CAMERAS_REPORT, LAYOUT_FILES
+from kgs.datasets.folders import CAMERAS_REPORT, LAYOUTS
 
 PHOTOS = Path(__file__).parent / "demo_photos"  # six training photos, two held out, and their cameras
 CREDIT = "Photos: Piero Toffanin, dataset_banana (MIT licence)."
@@ -20,7 +20,7 @@ _SHAPE = 3 / 4  # height of the room's pictures, relative to their width
 
 def write_bananas(folder: Path) -> None:
     """Write the photos of the package and their cameras to a folder."""
-    content = read_json(PHOTOS / LAYOUT_FILES["nerfstudio"])
+    content = read_json(PHOTOS / LAYOUTS["nerfstudio"].file)
     images = folder / "images"
     images.mkdir(exist_ok=True)
     for path in (*PHOTOS.glob("*.jpg"), PHOTOS / "LICENSE"):
@@ -29,7 +29,7 @@ def write_bananas(folder: Path) -> None:
         content[key] = [f"images/{name}" for name in content[key]]
     for frame in content["frames"]:
         frame["file_path"] = f"images/{frame['file_path']}"
-    write_json(folder / LAYOUT_FILES["nerfstudio"], content)
+    write_json(folder / LAYOUTS["nerfstudio"].file, content)
     write_json(folder / CAMERAS_REPORT, {"origin": CREDIT, "poses": "found by kgs from all eight photos"})
 
 
@@ -57,5 +57,5 @@ def write_room(folder: Path, side: int, seed: int) -> None:
         "test_filenames": names[len(scene.train) :],
         "frames": frames,
     }
-    write_json(folder / LAYOUT_FILES["nerfstudio"], content)
+    write_json(folder / LAYOUTS["nerfstudio"].file, content)
     write_json(folder / CAMERAS_REPORT, {"origin": "A synthetic room.", "poses": "known exactly"})

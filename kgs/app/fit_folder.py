@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 from kgs._support.errors import printable
 from kgs._support.json_files import write_json
-from kgs._support.machine import check_packages
 from kgs.app.files.cameras import as_taken
 from kgs.app.files.figures import write_curve
 from kgs.app.files.fit_files import CHECKPOINT, former_fit, is_finished, step_of
@@ -74,13 +73,11 @@ def fit_folder(
         TrainingDiverged: a number is not finite, or a scale explodes; the last checkpoint is kept.
         OSError: a result cannot be written.
         ValueError: the device cannot be used, or the backend does not run on it.
-        ModuleNotFoundError: the backend is numba or triton, which is not installed; or a package of the extra `app` is
-            missing.
+        ModuleNotFoundError: the backend is numba or triton, which is not installed.
     """
     out = results.out
     work = results.work
     stages = Stages(say) if stages is None else stages
-    check_packages("jinja2")  # even what is used only after training
     check_before_points(scene, config, lpips is not None)
     former = _former(out, resume, say)
     notes = _Notes(say)

@@ -10,7 +10,8 @@ from kgs._support.errors import DataError, quoted
 from kgs._support.json_files import is_number
 from kgs.datasets.options import MASK_MODES
 from kgs.datasets.source import SceneSource
-from kgs.fit.config import DETAILS
+
+from .details import DETAILS
 
 if TYPE_CHECKING:
     from kgs.datasets.scene import Scene
@@ -83,7 +84,7 @@ class SceneRequest:
     def full_side(self, scene: "Scene") -> int | None:
         """The longer side in pixels with `--detail high`; None where the photos of the fit are about as large."""
         side = max(scene.train.images.shape[-2:])
-        largest = min(DETAILS["high"].size, round(side * (self.downscale or 1.0)))
+        largest = min(DETAILS["high"].size, round(side * self.shrink(scene)))
         return largest if largest > _LARGER * side else None
 
     def shrink(self, scene: "Scene") -> float:

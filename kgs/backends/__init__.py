@@ -5,7 +5,8 @@
     "triton"  float32 on GPUs that torch calls "cuda" (NVIDIA, AMD) or "xpu" (`kgs.backends.gpu`; torch brings Triton on
               Linux); on others, as "mps", torch is the only one
 
-A backend is a table of stages, see :class:`Backend`; a new one is a folder, and a line in `BACKENDS`. A renderer, a
+A backend is a table of stages, see :class:`Backend`; a new one is a folder, a line in `BACKENDS`, its name in
+`kgs.fit.config.Backend`, and its package in `kgs._support` (`extras.py`, `machine.py`). A renderer, a
 model or a fit chooses once, by :func:`get_backend`, and hands the table down.
 """
 

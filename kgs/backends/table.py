@@ -3,6 +3,7 @@
 import functools
 import importlib.util
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
@@ -11,6 +12,7 @@ import torch
 from torch import Tensor
 
 from kgs._support.errors import ArgumentError
+from kgs._support.torch_threads import torch_on_one_thread
 from kgs.geometry.types import ProjectedGaussians, RasterOptions
 
 from .signatures import (
@@ -70,11 +72,13 @@ class Backend:
         tile_size: side of its tiles in pixels, where `RasterOptions.tile_size` is None.
         max_width: of images that it composites, in pixels.
         max_absgrad_features: how many features it composites with `RasterOptions.absgrad`.
-        is_named: whether the user asked for it by name: then torch does not take its place.
+        has_torch_on_one_thread: whether torch runs on one thread beside it, see `kgs._support.torch_threads`.
+        is_named: whether a user, or the fit that goes on, asked for it by name: then :meth:`covering` refuses what it
+            does not cover. A stage may still call torch for a part of its cases, as other lenses.
         activate, project, compositor, blend: the stages of a render.
         loss, loss_gradient, local_moments: of the photometric loss; None where `kgs.losses` computes it in torch.
-        adam_step, add_gradient_norms, decay_opacity: of what a fit does with gradients, in place; None where
-            `kgs.fit.adam` and `kgs.densify` do it in torch.
+        adam_step, add_gradient_norms, decay_opacity: of what a fit does with gradients, in place: all three, or None
+            where `kgs.fit.adam` and `kgs.densify` do it in torch.
     """
 
     name: str
@@ -86,6 +90,7 @@ class Backend:
     tile_size: int = 8
     max_width: float = float("inf")
     max_absgrad_features: float = float("inf")
+    has_torch_on_one_thread: bool = False
     is_named: bool = False
 
     activate: Activate = activation.activate
@@ -106,6 +111,10 @@ class Backend:
     def runs_on(self, device: torch.device) -> bool:
         """Whether it runs on such a device."""
         return self.devices is None or device.type in self.devices
+
+    def beside(self) -> AbstractContextManager[None]:
+        """For a fit with this backend: limits torch to one thread where kernels on a CPU do most of the work."""
+        return torch_on_one_thread() if self.has_torch_on_one_thread else nullcontext()
 
     def covering(self, stage: str, like: Tensor, fits: bool = True) -> "Backend":
         """This backend where it covers a call, and torch's otherwise.

@@ -21,9 +21,9 @@ from .timing import take_turns
 COUNTS = (10_000, 50_000)  # Gaussians whose training steps are timed
 # of each extra a package that only it brings, and what it is for
 _EXTRAS = {
-    "scenes": ("cv2", "photos, scenes and fits"),
+    "scenes": ("cv2", "photos, scenes and initial points"),
     "fast": ("numba", "kernels for CPUs"),
-    "app": ("matplotlib", "the other commands"),
+    "app": ("matplotlib", "fits and the other commands"),
     "sfm": ("pycolmap", "photos without cameras"),
     "heic": ("pi_heif", "iPhone's photos"),
     "study": ("pandas", "kgs study"),

@@ -39,7 +39,7 @@ TARGETS = {
 
 
 def speed(*, out: Path, quick: bool = False, device: str = "cpu") -> None:
-    """Time and memory of renders and training steps on this machine: of torch and numba, by stage, by what is asked.
+    """Time and memory of renders and training steps on this machine: of torch and kernels, by stage, by what is asked.
 
     For example:
       kgs bench speed -o speed

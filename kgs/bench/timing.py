@@ -36,7 +36,7 @@ def take_turns(cases: dict[str, Case], repeats: int = 5, device: torch.device = 
 
 def time_parts(run: Callable[[], Iterator[str]], repeats: int = 5, device: torch.device = CPU) -> dict[str, Times]:
     """As `take_turns`, of the parts of `run`, which yields the name of each when it is done; a GPU is waited for."""
-    wait = torch.cuda.synchronize if device.type == "cuda" else lambda: None
+    wait = (lambda: None) if device.type == "cpu" else torch.get_device_module(device).synchronize
     walls: dict[str, list[float]] = {}
     cpus: dict[str, list[float]] = {}
     for round_ in range(repeats + 1):

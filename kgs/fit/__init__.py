@@ -15,47 +15,7 @@ Examples:
     >>> fit = prune(trainer.result())  # as `fit_scene(scene, config)`
 """
 
-from typing import TYPE_CHECKING
+from kgs._support.lazy import public_names
 
-from kgs._support.lazy import lazy_names
-
-from .config import FitConfig
-
-if TYPE_CHECKING:
-    from kgs.init_points import InitialPoints, initial_points
-
-    from .fit import Fit
-    from .measures import measure
-    from .plan import Plan, make_plan
-    from .pruning import prune
-    from .run import Hooks, choose_points, fit_scene
-    from .trainer import Trainer
-
-__all__ = [
-    "InitialPoints",
-    "FitConfig",
-    "Plan",
-    "Trainer",
-    "Fit",
-    "initial_points",
-    "choose_points",
-    "make_plan",
-    "prune",
-    "fit_scene",
-    "Hooks",
-    "measure",
-]
-
-# the other names import torch, OpenCV and safetensors
-__getattr__, __dir__ = lazy_names(
-    __name__,
-    {
-        "kgs.init_points": ("InitialPoints", "initial_points"),
-        "kgs.fit.plan": ("Plan", "make_plan"),
-        "kgs.fit.trainer": ("Trainer",),
-        "kgs.fit.fit": ("Fit",),
-        "kgs.fit.run": ("Hooks", "choose_points", "fit_scene"),
-        "kgs.fit.pruning": ("prune",),
-        "kgs.fit.measures": ("measure",),
-    },
-)
+# torch, OpenCV and safetensors are imported with the names that need them
+__getattr__, __dir__, __all__ = public_names(__name__, __file__)

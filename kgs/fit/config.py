@@ -310,33 +310,3 @@ PAPER = FitConfig(
     ),
 )
 PRESETS = {"auto": FitConfig(), "paper": PAPER, "plain": replace(PAPER, drop=0.0)}
-
-
-class Detail(NamedTuple):
-    """How much detail a fit is to show: the size of the photos, and the entries of `FitConfig` that suit it."""
-
-    size: int  # pixels of the longer side
-    entries: dict[str, Any]
-
-
-# low: fewer steps, a third of them on a quarter of the pixels, and fewer points. high: more pixels and points; half of
-# the steps use a quarter of the pixels.
-DETAILS = {
-    "low": Detail(378, {"steps": 700, "coarse": 0.3, "init_points": 12_000}),
-    "normal": Detail(800, {}),
-    "high": Detail(1000, {"coarse": 0.5, "init_points": 90_000}),
-}
-COARSE = 0.5  # of unposed photos at the size of normal detail
-# A fit, its page and its film in half a minute on two cores: of the photos of `kgs demo`, and of its room.
-DEMO_STEPS = 350
-DEMO = FitConfig(
-    steps=DEMO_STEPS,
-    drop=DROP,
-    sh_degree=0,
-    exposure="same",
-    coarse=0.7,
-    init_points=30_000,
-    max_gaussians=30_000,
-    evaluations=4,
-)
-ROOM_DEMO = replace(DEMO, coarse=0.3, init_points=12_000, max_gaussians=16_000)

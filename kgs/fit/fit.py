@@ -8,7 +8,6 @@ import torch
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from kgs._support.torch_threads import threads_beside
 from kgs.backends import Backend, get_backend
 from kgs.datasets.scene import Scene, Views
 from kgs.geometry.cameras import to
@@ -106,7 +105,7 @@ class Fit:
         camera = to(camera, self.device)
         background = self._background if gains is None else None
         outputs = ("image", *outputs) if gains is None else ("image", "alpha", *outputs)
-        with threads_beside(self.backend):
+        with self._table.beside():
             rendering: Any = self._renderer(self.model(backend=self._table), camera, background, outputs=outputs)
         if gains is None:
             return rendering.image, rendering

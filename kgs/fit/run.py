@@ -9,7 +9,8 @@ from kgs._support.checks import check_kind
 from kgs._support.errors import DataError, quoted
 from kgs._support.progress import ProgressBar, silent
 from kgs.datasets.scene import Scene
-from kgs.init_points import InitialPoints, initial_points
+from kgs.init_points import InitialPoints as InitialPoints
+from kgs.init_points import initial_points as initial_points
 from kgs.init_points.in_view import check_in_view
 
 from .config import FitConfig, min_side

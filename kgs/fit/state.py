@@ -13,6 +13,7 @@ from torch import Tensor
 
 from kgs._support.errors import ArgumentError, quoted
 from kgs._support.json_files import is_number
+from kgs.backends import BACKENDS
 from kgs.datasets.scene import Scene, Views
 from kgs.densify import Densifier
 from kgs.drop import DropGaussian
@@ -308,7 +309,7 @@ def _is_point(value: Any) -> bool:
 
 # The plain values of a saved fit: what is expected of each in words, and the check.
 PLAIN: dict[str, tuple[str, Callable[[Any], bool]]] = {
-    "backend": ("one of ['torch', 'numba', 'triton']", lambda v: v in ("torch", "numba", "triton")),
+    "backend": (f"one of {list(BACKENDS)}", lambda v: v in BACKENDS),
     "init": ("kind and number of initial points", lambda v: v.keys() == {"kind", "points"} and _is_count(v["points"])),
     "step": ("a number of steps", _is_count),
     "seconds": ("a number, not negative", lambda v: is_number(v, 0)),

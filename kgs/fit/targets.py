@@ -49,9 +49,12 @@ class _AtMostOne(torch.autograd.Function):
     """`clamp(max=1)` in memory of `kgs._support.memory`, where torch makes two more images in the backward pass."""
 
     @staticmethod
-    def forward(ctx: Any, image: Tensor) -> Tensor:
-        ctx.save_for_backward(image)
+    def forward(image: Tensor) -> Tensor:
         return torch.clamp(image, max=1.0, out=empty(tuple(image.shape), image))
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> Tensor:

@@ -22,7 +22,6 @@ from torch import Tensor
 from kgs._support.checks import check_kind
 from kgs._support.default_device import cpu_by_default
 from kgs._support.errors import ArgumentError, TrainingDiverged
-from kgs._support.torch_threads import threads_beside
 from kgs.backends import BACKENDS, get_backend
 from kgs.datasets.scene import Scene
 from kgs.geometry.types import Gaussians, RasterOptions, Rendering
@@ -171,17 +170,17 @@ class Trainer:
         if state.step >= schedule.steps:
             raise ArgumentError("steps", f"a step of {schedule.steps} to be left", "none")
         start = time.perf_counter()
-        with threads_beside(self.plan.backend), torch.enable_grad():
+        with self._backend.beside(), torch.enable_grad():
             loss = self._optimize()
         state.seconds += time.perf_counter() - start
         if state.step in schedule.evaluate:  # before densifying: right after it the image is 2 dB worse for a while
             self._measure_curve()
         start = time.perf_counter()
         if state.step in schedule.haze:
-            with threads_beside(self.plan.backend):
+            with self._backend.beside():
                 state.densifier.decay_opacity(FADE, veils(self.result()))
         if state.step in schedule.densify:
-            with threads_beside(self.plan.backend):
+            with self._backend.beside():
                 self._densify()
         if state.step in schedule.reset:
             state.densifier.reset_opacity(self.plan.config.recipe.reset_opacity)
@@ -326,7 +325,9 @@ class Trainer:
         if threshold != self.renderer.options.alpha_threshold:
             self.renderer.options = replace(self.renderer.options, alpha_threshold=threshold)
         rate = decayed(recipe.lr_means, recipe.lr_means_final, progress)
-        state.optimizer.param_groups[0]["lr"] = state.start.extent * rate
+        for group in state.optimizer.param_groups:
+            if group["name"] == "means":
+                group["lr"] = state.start.extent * rate
         degree = sum(state.step >= step for step in self.plan.schedule.sh)
         if degree > state.model.sh_degree:  # a finished fit that goes on keeps its degree
             state.model.sh_degree = degree

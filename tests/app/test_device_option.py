@@ -1,4 +1,4 @@
-"""`--device` of the commands: what auto takes, what is said of it, and what a resumed fit goes on with."""
+"""`--device` and `--backend`: what auto takes, what is said of it, and what a resumed fit goes on with."""
 
 import inspect
 import logging
@@ -8,13 +8,16 @@ from types import SimpleNamespace
 import pytest
 import torch
 from command import one_line, run
+from refusals import refused
 
-from kgs import backends
-from kgs._support.json_files import read_json, write_json
+from kgs import DataError, backends
+from kgs._support.json_files import write_json
 from kgs.app.cli import tools
 from kgs.app.cli.run import COMMANDS, load_command
 from kgs.app.files.fit_files import CHECKPOINT, UNFINISHED
 from kgs.app.files.results import MARKER
+from kgs.fit import FitConfig, Trainer
+from kgs.fit.plan import make_plan
 
 QUICK = ("--init", "random", "--init-points", 30, "--evaluations", 1)
 
@@ -97,15 +100,6 @@ def test_auto_is_the_default_of_all_commands():
     assert {*defaults.values()} == {"auto"}
 
 
-def test_a_fit_names_its_device_and_keeps_it(folder, tmp_path, capsys):
-    out = tmp_path / "out"
-    threads = torch.get_num_threads()
-    assert run("fit", folder, "-o", out, "--steps", 2, *QUICK) == 0
-    cores = f"{threads} core" if threads == 1 else f"{threads} cores"
-    assert capsys.readouterr().out.startswith(f"device: CPU, {cores}\n")
-    assert read_json(out / "config.json")["fit"]["device"] == "cpu"
-
-
 @pytest.mark.parametrize(("begun", "taken"), [("cpu", "cpu"), ("cpu:0", "cpu"), ("cuda", "cuda"), (None, "cuda")])
 def test_a_fit_of_a_cpu_goes_on_there_where_there_is_a_gpu_too(
     card, folder, tmp_path, capsys, monkeypatch, begun, taken
@@ -123,3 +117,16 @@ def test_a_fit_of_a_cpu_goes_on_there_where_there_is_a_gpu_too(
         assert run("fit", folder, "-o", out, *options, *QUICK) == 7
         named = capsys.readouterr().out.splitlines()[0]
         assert named.startswith("device: CPU, " if expected == "cpu" else "device: Card 9000 (cuda)")
+
+
+@pytest.mark.parametrize(("begun", "other"), [("torch", "numba"), ("numba", "torch")])
+def test_a_resumed_fit_goes_on_with_the_backend_it_was_begun_with(card, scene, points, tmp_path, begun, other):
+    config = FitConfig(steps=3, evaluations=1, init="random", init_points=50, backend=begun)
+    trainer = Trainer(scene, make_plan(scene, config, points), points)
+    trainer.train_step()
+    trainer.save(tmp_path / CHECKPOINT)
+    for asked in ("auto", begun):
+        resumed = Trainer.resume(scene, replace(config, backend=asked), tmp_path / CHECKPOINT)
+        assert (resumed.plan.backend, resumed.renderer.backend.name) == (begun, begun)
+    with refused(DataError, path=tmp_path / CHECKPOINT, key="backend"):
+        Trainer.resume(scene, replace(config, backend=other), tmp_path / CHECKPOINT)

@@ -21,9 +21,9 @@ from kgs._support.json_files import write_json
 from kgs.app.cli.render import render
 from kgs.app.files import exports
 from kgs.app.files.cameras import camera_list, upright
+from kgs.app.files.film import path_near_plane
 from kgs.app.files.fit_files import EXPORTS
 from kgs.app.files.preview import write_preview
-from kgs.app.files.results import Results
 from kgs.datasets import Scene
 from kgs.fit import Fit
 from kgs.geometry.multiview import typical_depths
@@ -127,23 +127,6 @@ def test_the_film_that_cannot_be_is_a_note(fit: Fit, tmp_path: Path, monkeypatch
     assert exports.write_exports(fit, tmp_path) == ["no turntable.webm: a reason"]
 
 
-def test_one_film_takes_the_place_of_the_other(fit: Fit, tmp_path: Path, monkeypatch: Any) -> None:
-    pytest.importorskip("av")
-
-    def publish() -> list[str]:
-        with Results.open(tmp_path / "out", "fit") as results, results.stage() as new:
-            exports.write_exports(fit, new)
-        return sorted(path.name for path in (tmp_path / "out").glob("turntable.*"))
-
-    with monkeypatch.context() as patch:
-        patch.setitem(sys.modules, "av", None)
-        assert publish() == ["turntable.webm"]
-    assert publish() == ["turntable.mp4"]
-    (tmp_path / "out" / "turntable.webm").write_bytes(b"mine")
-    assert publish() == ["turntable.mp4", "turntable.webm"]
-    assert (tmp_path / "out" / "turntable.webm").read_bytes() == b"mine"
-
-
 @pytest.mark.parametrize("background", ["black", "white"])
 def test_a_png_with_alpha_over_a_background_is_the_opaque_one(folder: Path, tmp_path: Path, background: Any) -> None:
     points = torch.rand(300, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor([-0.5, -1.25, -0.5])
@@ -180,6 +163,7 @@ def test_the_film_leaves_out_what_is_right_before_its_camera(fit: Fit, tmp_path:
         ]
     assert (images[0] - images[1]).abs().max() > 0.01
     torch.testing.assert_close(renders[0](camera), images[1])
+    assert path_near_plane(fit.model.means, fit.scene.train.cameras, 1e3) == 1e3  # never nearer than that of the fit
 
 
 @pytest.mark.parametrize("size", [(30, 60), (60, 30)])

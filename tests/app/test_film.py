@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 import sys
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -14,27 +13,13 @@ import numpy as np
 import pytest
 import torch
 from browser import Browser
-from factories import pinhole, with_camera
+from factories import looking_at, pinhole, with_camera
 from torch import Tensor
 
-from kgs import GaussianRenderer, Gaussians
 from kgs.app.files import encoders, film
 from kgs.app.files.film import camera_path, write_film
 from kgs.datasets.scene import Views
-
-
-def looking_at(target: Tensor, centers: Tensor) -> Tensor:
-    """World-to-camera matrices of cameras with these centres that look at the target; the world's z is up."""
-    poses = []
-    for center in centers.double():
-        ahead = (target - center) / (target - center).norm()
-        right = torch.linalg.cross(ahead, torch.tensor([0.0, 0.0, 1.0]).double())
-        right = right / right.norm()
-        turn = torch.stack([right, torch.linalg.cross(ahead, right), ahead])
-        pose = torch.eye(4).double()
-        pose[:3, :3], pose[:3, 3] = turn, -turn @ center
-        poses.append(pose)
-    return torch.stack(poses)
+from kgs.geometry.rigs import camera_centers, degrees_between
 
 
 def ring(count: int, radius: float = 3.0) -> Tensor:
@@ -42,7 +27,7 @@ def ring(count: int, radius: float = 3.0) -> Tensor:
     angles = 2 * math.pi * torch.arange(count).double() / count
     ringed = torch.stack([radius * angles.cos(), radius * angles.sin(), 1 + 0.3 * (3 * angles).sin()], 1)
     order = torch.randperm(count, generator=torch.Generator().manual_seed(count))
-    return looking_at(torch.zeros(3).double(), ringed[order])
+    return looking_at(torch.zeros(3), ringed[order], torch.tensor([0.0, 0.0, 1.0]))
 
 
 def facing(count: int) -> Tensor:
@@ -52,16 +37,6 @@ def facing(count: int) -> Tensor:
         [2.0, 1.0, 0.1]
     )
     return poses
-
-
-def centers(poses: Tensor) -> Tensor:
-    return torch.linalg.inv(poses)[:, :3, 3]
-
-
-def angles(a: Tensor, b: Tensor) -> Tensor:
-    """Degrees between the rotations of poses."""
-    cosine = ((a[:, :3, :3] * b[:, :3, :3]).sum((1, 2)) - 1) / 2
-    return cosine.clamp(-1, 1).acos().rad2deg()
 
 
 def evenly(frames: int) -> Any:
@@ -81,15 +56,15 @@ PATHS = {
 def test_the_path_passes_each_camera_and_is_smooth(request: Any, poses: Tensor) -> None:
     path = camera_path(poses, evenly(2000), 1.0)
     if "6 facing" in request.node.name:  # cameras side by side are never left
-        assert (centers(path) >= centers(poses).amin(0) - 1e-9).all()
-        assert (centers(path) <= centers(poses).amax(0) + 1e-9).all()
+        assert (camera_centers(path) >= camera_centers(poses).amin(0) - 1e-9).all()
+        assert (camera_centers(path) <= camera_centers(poses).amax(0) + 1e-9).all()
     for pose in poses:
         nearest = int((path - pose).abs().amax((1, 2)).argmin())
-        assert (centers(path)[nearest] - centers(pose[None])[0]).norm() < 0.02
-        assert angles(path[nearest, None], pose[None]) < 0.5
+        assert (camera_centers(path)[nearest] - camera_centers(pose[None])[0]).norm() < 0.02
+        assert degrees_between(path[nearest, :3, :3], pose[:3, :3]) < 0.5
     assert torch.allclose(path[:, :3, :3] @ path[:, :3, :3].mT, torch.eye(3).double(), atol=1e-12)
-    moves = centers(path).diff(dim=0, append=centers(path)[:1])  # the first frame follows the last
-    turns = angles(path, path.roll(-1, 0))
+    moves = camera_centers(path).diff(dim=0, append=camera_centers(path)[:1])  # the first frame follows the last
+    turns = degrees_between(path[:, :3, :3], path.roll(-1, 0)[:, :3, :3])
     assert moves.norm(dim=1).max() < 4 * moves.norm(dim=1).mean()
     assert turns.max() <= 4 * turns.mean() + 1e-3
     assert (moves.diff(dim=0).norm(dim=1) < 0.2 * moves.norm(dim=1).max()).all()  # no corner
@@ -98,8 +73,8 @@ def test_the_path_passes_each_camera_and_is_smooth(request: Any, poses: Tensor) 
 def test_cameras_around_an_object_are_passed_on_arcs_that_look_at_it() -> None:
     poses = ring(5)
     path = camera_path(poses, evenly(100), 1.0)
-    positions = centers(path)
-    radii, lengths = positions.norm(dim=1), centers(poses).norm(dim=1)
+    positions = camera_centers(path)
+    radii, lengths = positions.norm(dim=1), camera_centers(poses).norm(dim=1)
     assert (lengths.min() - 0.05 < radii).all()  # a chord of the ring would come to 2.4
     assert (radii < lengths.max() + 0.05).all()
     assert (-(path[:, 2, :3] * positions).sum(1) / radii > 0.999).all()
@@ -111,8 +86,8 @@ def test_cameras_around_an_object_are_passed_on_arcs_that_look_at_it() -> None:
 def test_the_camera_moves_at_one_speed_between_the_ends(poses: Tensor) -> None:
     """Measured on the poses of the film: where the path does not turn back, steps are as long as each other."""
     path = film.resample_by_speed(poses, 400, 3.0)
-    positions = centers(path)
-    unit = torch.cdist(centers(poses), centers(poses)).max() if len(poses) > 1 else 3.0
+    positions = camera_centers(path)
+    unit = torch.cdist(camera_centers(poses), camera_centers(poses)).max() if len(poses) > 1 else 3.0
     moves = torch.cat([positions / unit, path[:, 2, :3] / math.pi], 1).diff(dim=0)
     lengths = moves.norm(dim=1)
     ahead = moves / lengths[:, None]
@@ -130,21 +105,10 @@ def test_the_camera_moves_at_one_speed_between_the_ends(poses: Tensor) -> None:
     torch.testing.assert_close(path[0], camera_path(poses, evenly(1), 3.0)[0])
 
 
-def test_an_even_path_takes_each_step_in_the_same_time() -> None:
-    """Against the plain round of a circle: 86 % of the way at one speed, the rest at half of it on the mean."""
-    count, frames = 12, 240
-    rim = 2 * math.pi * torch.arange(count).double() / count
-    poses = looking_at(torch.zeros(3).double(), torch.stack([rim.cos(), rim.sin(), 0.3 * torch.ones(count)], 1))
-    positions = centers(film.resample_by_speed(poses, frames, 1.0))
-    steps = torch.atan2(positions[:, 1], positions[:, 0]).diff().remainder(2 * math.pi)
-    steps = torch.minimum(steps, 2 * math.pi - steps)
-    expected = 2 * math.pi / frames * (0.86 + 2 * 0.14)
-    torch.testing.assert_close(steps[40:200], torch.full((160,), expected).double(), rtol=0.02, atol=0)
-
-
 @pytest.mark.parametrize(("count", "bound"), [(12, 1.2), (40, 1.3)])
 def test_the_round_trip_is_short(count: int, bound: float) -> None:
-    assert centers(camera_path(ring(count), evenly(120), 1.0)).diff(dim=0).norm(dim=1).sum() < 2 * math.pi * 3.0 * bound
+    path = camera_path(ring(count), evenly(120), 1.0)
+    assert camera_centers(path).diff(dim=0).norm(dim=1).sum() < 2 * math.pi * 3.0 * bound
 
 
 def test_a_single_camera_sways_and_keeps_its_target() -> None:
@@ -154,7 +118,7 @@ def test_a_single_camera_sways_and_keeps_its_target() -> None:
     target = torch.linalg.inv(pose) @ torch.tensor([0.0, 0.0, 4.0, 1.0]).double()
     seen = path @ target
     torch.testing.assert_close(seen[:, :2], torch.zeros(60, 2).double(), atol=1e-9, rtol=0)
-    moved = (centers(path) - centers(pose[None])).norm(dim=1)
+    moved = (camera_centers(path) - camera_centers(pose[None])).norm(dim=1)
     assert 0.05 < moved.max() < 0.5
 
 
@@ -163,11 +127,9 @@ def test_cameras_with_one_centre_are_no_trouble() -> None:
     assert film.resample_by_speed(facing(1).repeat(3, 1, 1), 10, 1.0).isfinite().all()
 
 
-def views_of(size: tuple[int, int], focal: float | None = None, poses: Tensor | None = None) -> Views:
-    focal = 0.9 * size[1] if focal is None else focal
-    poses = facing(3) if poses is None else poses
-    cameras = pinhole(*size, focal, dtype=torch.float32, cameras=3)
-    return Views(with_camera(cameras, poses.float()), torch.zeros(3, 3, *size), ("a", "b", "c"))
+def views_of(size: tuple[int, int]) -> Views:
+    cameras = pinhole(*size, 0.9 * size[1], dtype=torch.float32, cameras=3)
+    return Views(with_camera(cameras, facing(3).float()), torch.zeros(3, 3, *size), ("a", "b", "c"))
 
 
 def render(camera: Any) -> Tensor:
@@ -215,45 +177,6 @@ def test_the_frames_are_the_renders(
     assert centre[0] == pytest.approx(centre[1], abs=1e-3)
 
 
-def test_a_film_does_not_flash_where_it_passes_through_gaussians(tmp_path: Path, monkeypatch: Any) -> None:
-    """Three cameras side by side before a wall; between them black Gaussians, outside of their pictures."""
-    monkeypatch.setattr(film, "FRAMES", 48)
-    generator = torch.Generator().manual_seed(0)
-    count = 3000
-    spread = torch.rand(count, 3, generator=generator) * 2 - 1
-    wall = spread * torch.tensor([8.0, 5.0, 0.1]) + torch.tensor([0.0, 0.0, 4.0])
-    between = torch.tensor([[-0.75, 0.0, 0.1], [0.75, 0.0, 0.1]])
-    means = torch.cat([wall, between])
-    n = len(means)
-    scales = torch.full((n, 3), 0.2)
-    scales[count:] = 0.1
-    colors = torch.cat([0.4 + 0.2 * torch.rand(count, 3, generator=generator), torch.zeros(2, 3)])
-    quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1)
-    gaussians = Gaussians(means, quats, scales, torch.full((n,), 0.9), colors)
-    poses = torch.eye(4).repeat(3, 1, 1)
-    poses[:, 0, 3] = torch.tensor([1.5, 0.0, -1.5])
-    views = views_of((36, 48), 48.0, poses)
-
-    def levels(near_plane: float) -> list[float]:
-        renderer = GaussianRenderer(near_plane=near_plane).eval()
-        found = []
-
-        def render(camera: Any) -> Tensor:
-            image = renderer(gaussians, camera).image
-            found.append(float(image.mean()))
-            return image
-
-        assert write_film(tmp_path / "a.webm", render, views, 4.0) == ""
-        return found
-
-    near_plane = film.path_near_plane(gaussians.means, views.cameras, 0.01)
-    assert near_plane == pytest.approx(0.5 * 3.9, rel=0.02)
-    dark, clear = levels(0.01), levels(near_plane)
-    assert min(dark) < 0.5 * max(dark)
-    assert min(clear) > 0.97 * max(clear)
-    assert film.path_near_plane(gaussians.means, views.cameras, 3.0) == 3.0
-
-
 def test_a_phone_plays_the_mp4(tmp_path: Path) -> None:
     """Main profile, 4:2:0, eight bits, the index in front; as the bytes of ISO/IEC 14496-12, not by FFmpeg."""
     pytest.importorskip("av")
@@ -291,36 +214,6 @@ def test_each_frame_has_its_time(tmp_path: Path, suffix: str) -> None:
     assert times == pytest.approx([i / 24 for i in range(60)], abs=1e-4 if suffix == ".mp4" else 5e-4)
 
 
-def test_frames_are_made_while_others_are_encoded(tmp_path: Path, monkeypatch: Any, suffix: str) -> None:
-    """The second frame is made before the first one is encoded, which waits for it; no more than a few are ahead."""
-    made: list[int] = []
-    encoded: list[int] = []
-    ahead: list[int] = []
-    second = threading.Event()
-    write = encoders._in_thread
-
-    def frames() -> Any:
-        for i in range(30):
-            made.append(i)
-            if i == 1:
-                second.set()
-            ahead.append(len(made) - len(encoded))
-            yield np.full((48, 64, 3), 8 * i, np.uint8)
-
-    def watched(work: Any, frames: Any) -> int:
-        def slowly(frame: Any) -> None:
-            assert second.wait(20)
-            work(frame)
-            encoded.append(frame[0, 0, 0] // 8)
-
-        return write(slowly, frames)
-
-    monkeypatch.setattr(encoders, "_in_thread", watched)
-    assert encoders.encode(tmp_path / f"a{suffix}", frames(), (64, 48)) == ""
-    assert encoded == made == list(range(30))
-    assert max(ahead) <= 8
-
-
 @pytest.mark.parametrize("last", [0, 2, 9])
 def test_an_error_of_the_encoder_reaches_the_caller(last: int) -> None:
     """Also of the last frame, after which no other one is made; and no frame comes after it."""
@@ -336,40 +229,30 @@ def test_an_error_of_the_encoder_reaches_the_caller(last: int) -> None:
     assert encoded[: last + 1] == list(range(last + 1))
 
 
-def test_without_pyav_films_are_webm(tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setitem(sys.modules, "av", None)
-    assert encoders.film_suffix() == ".webm"
-    assert write_film(tmp_path / "a.mp4", render, views_of((12, 16)), 1.0).startswith("no a.mp4: ")
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("codec", ["h264_nothing", "h264_v4l2m2m"])
-def test_without_an_encoder_that_works_films_are_webm(tmp_path: Path, monkeypatch: Any, codec: str) -> None:
-    """One that FFmpeg does not have, and one of a device that is not there."""
-    pytest.importorskip("av")
-    monkeypatch.setattr(encoders, "_H264", codec)
-    assert encoders.film_suffix() == ".webm"
-    assert write_film(tmp_path / "a.mp4", render, views_of((12, 16)), 1.0).startswith("no a.mp4: ")
-    assert list(tmp_path.iterdir()) == []
-
-
 def no_session(*_: Any, **__: Any) -> None:
     raise pytest.importorskip("av").error.ExternalError(1, "no session left")
 
 
 @pytest.mark.parametrize(
-    ("name", "broken", "by", "reason"),
+    ("name", "replaced", "by", "reason"),
     [
+        ("a.mp4", None, None, "no a.mp4: it needs PyAV"),
+        ("a.mp4", "kgs.app.files.encoders._H264", "h264_nothing", "no a.mp4: it needs PyAV"),
+        ("a.mp4", "kgs.app.files.encoders._H264", "h264_v4l2m2m", "no a.mp4: it needs PyAV"),  # a device is not there
         ("a.mp4", "av.open", no_session, "no a.mp4: .*no session left"),
         ("a.webm", "cv2.VideoWriter.fourcc", lambda *_: 0, "no a.webm: this OpenCV writes no WebM"),
     ],
-    ids=["encoder", "codec"],
+    ids=["package", "encoder", "device", "session", "codec"],
 )
 def test_what_fails_leaves_a_reason_and_no_file(
-    tmp_path: Path, monkeypatch: Any, name: str, broken: str, by: Any, reason: str
+    tmp_path: Path, monkeypatch: Any, name: str, replaced: str | None, by: Any, reason: str
 ) -> None:
-    pytest.importorskip("av")
-    monkeypatch.setattr(broken, by)
+    if replaced is None:
+        monkeypatch.setitem(sys.modules, "av", None)
+    else:
+        pytest.importorskip("av")
+        monkeypatch.setattr(replaced, by)
+    assert (encoders.film_suffix() == ".webm") == ("needs" in reason)
     assert re.match(reason, write_film(tmp_path / name, render, views_of((12, 16)), 1.0))
     assert list(tmp_path.iterdir()) == []
 

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import math
 import shlex
 from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 from command import one_line, run
+from factories import random_model
 from tiny_scenes import write_colmap
 
 import kgs
-from kgs import GaussianModel, save_ply
 
 
 @pytest.fixture(scope="module")
@@ -24,31 +22,12 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return scene
 
 
-def strays_alone(path: Path) -> None:
-    """Needles close together, and small ones all around, far from each other."""
-    n = 20
-    angles = 2 * math.pi * torch.arange(n) / n
-    ring = torch.stack([angles.cos(), angles.sin(), 0 * angles], 1)
-    z = 1 - 2 * (torch.arange(n) + 0.5) / n
-    turns = math.pi * (1 + 5**0.5) * torch.arange(n)
-    radius = (1 - z * z).sqrt()
-    sphere = 10 * torch.stack([radius * turns.cos(), radius * turns.sin(), z], 1)
-    scales = torch.tensor([[1.0, 0.001, 0.001]]).repeat(n, 1), torch.full((n, 3), 0.01)
-    quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(2 * n, 1)
-    zeros = torch.zeros(2 * n, 1, 3)
-    model = GaussianModel(
-        torch.cat([ring, sphere]), quats, torch.cat(scales).log(), zeros[:, 0, 0], zeros, zeros[:, 1:]
-    )
-    save_ply(path, model)
-
-
 @pytest.fixture(scope="module")
 def splats(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Files without Gaussians, of strays alone, and a folder that is called like a file."""
+    """A file without Gaussians, and a folder that is called like a file."""
     root = tmp_path_factory.mktemp("splats")
-    paths = {name: root / f"{name}.ply" for name in ("empty", "strays", "folder")}
-    strays_alone(paths["strays"])
-    kgs.save_ply(paths["empty"], kgs.load_ply(paths["strays"]).select(torch.arange(0)))
+    paths = {name: root / f"{name}.ply" for name in ("empty", "folder")}
+    kgs.save_ply(paths["empty"], random_model(0))
     paths["folder"].mkdir()
     return paths
 
@@ -60,7 +39,6 @@ def splats(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         ("fit {scene} -o {out} --init file --init-file {missing}", "missing"),
         ("fit {scene} -o {out} --max-gaussians 0", "--max-gaussians: expected"),
         ("fit {scene} -o {out} --drop 1", ", got 1.0"),  # a number, not a text
-        ("fit {scene} -o {out} --steps 0", ", got 0"),
         ("fit {scene} -o {out} --device cuda:99", "--device: expected"),
         ("fit {scene} -o {scene}", "{scene}: expected a new or empty folder"),
         ("fit {scene} -o {scene}/transforms_train.json", "expected a folder for results"),
@@ -71,53 +49,30 @@ def splats(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         ("fit {scene} -o {out} --downscale 2", "--downscale: expected at least 32 pixels, got photos"),
         ("fit {scene} --views 3", "-o: expected a folder for the results, for example kgs fit {scene} --views 3 -o "),
         ("fit {small} -o {out}", "{small}: images: expected at least 32 pixels"),
-        ("fit {scene} -o {out} --device gpu", "--device: expected"),
-        ("demo -o {out} --device foo", "--device: expected"),
-        ("demo -o {scene}", "{scene}: expected a new or empty folder"),
         ("eval {scene} --lpips-weights {missing}", "missing"),
         ("render {file} --cameras {scene} -o {out} --downscale 0.5", "--downscale: expected"),
         ("render {file} --cameras {scene} -o {scene}/train", "{scene}/train: expected a new or empty folder"),
-        ("render {file} --cameras {scene} -o {out} --device foo", "--device: expected"),
         ("render {file} --cameras {scene}", " -o transforms_train-render"),
         ("page {missing} --cameras {scene} -o {scene}.html", "missing"),
         ("fit {scene} -o ''", "--out: expected a path, got ''"),
-        ("fit {scene} -o=", "--out: expected a path, got ''"),
         ("fit '' -o {out}", "scene: expected a path, got ''"),
         ("fit ''", "scene: expected a path, got ''"),
         ("fit {scene} -o {out} --masks=", "--masks: expected a path, got ''"),
-        ("fit {scene} -o {out} --masks ''", "--masks: expected a path, got ''"),
-        ("fit {scene} -o {out} --lpips-weights ''", "--lpips-weights: expected a path, got ''"),
         ("fit {scene} -o {out} --init file --init-file ''", "--init-file: expected a path, got ''"),
-        ("demo -o ''", "--out: expected a path, got ''"),
-        ("render {file} --cameras '' -o {out}", "--cameras: expected a path, got ''"),
-        ("page '' --cameras {scene}", "splat: expected a path, got ''"),
-        ("clean {file} --out=", "--out: expected a path, got ''"),
-        ("export '' -o {out}", "splat: expected a path, got ''"),
-        ("eval ''", "out: expected a path, got ''"),
-        ("bench speed -o ''", "--out: expected a path, got ''"),
-        ("study -o ''", "--out: expected a path, got ''"),
         ("eval {fit} --device foo", "--device: expected"),
         ("page {splat} --cameras {scene} -o {out}/page.html", "expected a folder to write it to"),
         ("page {empty} --cameras {scene} -o {here}/page.html", "empty.ply: Gaussians: expected at least one"),
         ("render {empty} --cameras {scene} -o {out}", "empty.ply: Gaussians: expected at least one"),
         ("clean {splat} -o {here}/a.ply --strength -1", "--strength: expected"),
-        ("clean {missing} -o {here}/a.ply", "missing"),
         ("clean {empty} -o {here}/a.ply", "empty.ply: Gaussians: expected at least one"),
-        ("clean {strays} -o {here}/a.ply --strength 100", "--strength: expected one at which a Gaussian is left"),
-        ("clean {scene} -o {here}/a.ply", "config.json"),
         ("clean {fit} -o {here}/a.ply --cameras {scene}", "--cameras: expected a PLY file as SPLAT"),
         ("clean {fit} -o {here}/a.ply --downscale 2", "--downscale: expected a PLY file as SPLAT"),
         ("clean {splat} -o {here}/a.ply --downscale 2", "--downscale: expected --cameras"),
         ("clean {splat} -o {here}/a.ply --cameras {fit}/test", "{fit}/test"),
-        ("clean {splat} -o {here}/a.ply --cameras {missing}", "missing"),
-        ("clean {splat} -o {here}/a.ply --device foo", "--device: expected"),
         ("clean {file} -o {here}/a.ply", "got one without 'ply' in the first line"),
-        ("clean {splat} -o {out}", "--out: expected a file that ends in .ply"),
         ("clean {splat} -o {splat}", "--out: expected another file"),
-        ("clean {splat} -o {fit}/none/splat.ply", "expected a folder to write it to"),
         ("export {splat} -o {out}.sog", "--out: "),
         ("export {splat} -o {folder}", "folder.ply: "),
-        ("export {splat} -o {out}/a.ply", "a.ply: "),
         ("export {empty} -o {here}/a.ply", "empty.ply: vertex: "),
         ("export {folder} -o {here}/a.ply", "folder.ply/config.json"),
         ("page {splat} -o {here}/a.html", "--cameras: expected the scene of the PLY file"),
@@ -126,14 +81,11 @@ def splats(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         ("scale {fit} --by 1,2,3 4,5,6 2 -o {fit}", "{fit}"),  # which has the fit that goes on from its checkpoint
         ("scale {here} --by 1,2,3 4,5,6 2 -o {out}", "config.json"),
         ("scale {splat} --by 1,2,3 4,5,6 2 -o {out}", "--out"),
-        ("scale {splat} --by 1,2,3 4,5,6 2 -o {here}/none/splat.ply", "none"),
         ("scale {splat} --by 1,2,3 4,5,6 2 -o {splat}", "--out"),
-        ("scale {fit} --by 1,2 4,5,6 1 -o {out}", "--by: "),
         ("scale {fit} --by 1,2,3 4,5,x 1 -o {out}", "--by: "),
         ("scale {fit} --by 1,2,3 4,5,nan 1 -o {out}", "--by: "),
         ("scale {fit} --by -1,2,0.5 -1.0,2,0.50 1 -o {out}", "--by: "),  # the same point twice
         ("scale {fit} --by -1,2,0.5 -1,2,0.50001 1e308 -o {out}", "--by: "),
-        ("scale {fit} --by 1,2,3 4,5,6 0 -o {out}", "--by: "),
         ("scale {fit} --by 1,2,3 4,5,6 -2 -o {out}", "--by: "),
         ("scale {fit} --by 1,2,3 4,5,6 inf -o {out}", "--by: "),
         (
@@ -141,7 +93,6 @@ def splats(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
             "one of demo, fit, poses, render, eval, page, clean, scale, export, check, bench, study, got 'nonsense'",
         ),
         ("bench nonsense", "one of speed, precision, extremes, got"),
-        ("bench sped", "did you mean speed?"),
     ],
 )
 def test_mistakes_are_one_line_and_nothing_is_written(

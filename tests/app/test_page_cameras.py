@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from factories import batch, pinhole
+from factories import batch, looking_at, pinhole
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
@@ -66,18 +66,11 @@ def test_it_opens_at_the_best_of_the_middle_third() -> None:
 
 def around(*degrees: float, height: float = 0.0) -> dict[str, Any]:
     """What the viewer gets of cameras at these angles on a circle around the Gaussian, which they look at."""
-    cameras = []
-    for angle in map(math.radians, degrees):
-        center = MEANS[0].double() + 4.0 * torch.tensor([math.sin(angle), -height, -math.cos(angle)]).double()
-        forward = torch.nn.functional.normalize(MEANS[0].double() - center, dim=0)
-        right = torch.nn.functional.normalize(
-            torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]).double(), forward), dim=0
-        )
-        pose = torch.eye(4).double()
-        pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
-        pose[:3, 3] = -pose[:3, :3] @ center
-        cameras.append(pinhole(60, 80, (80.0, 80.0), (39.5, 29.5), 0.0, pose))
-    return viewer_scene(batch(*cameras), ["a"] * len(cameras), ["training"] * len(cameras), MEANS)
+    angles = torch.tensor(degrees).double().deg2rad()
+    offsets = torch.stack([angles.sin(), torch.full_like(angles, -height), -angles.cos()], 1)
+    poses = looking_at(MEANS[0], MEANS.double() + 4.0 * offsets, torch.tensor([0.0, -1.0, 0.0]))
+    cameras = batch(*(pinhole(60, 80, (80.0, 80.0), (39.5, 29.5), 0.0, pose) for pose in poses))
+    return viewer_scene(cameras, ["a"] * len(poses), ["training"] * len(poses), MEANS)
 
 
 @pytest.mark.parametrize("degrees", [(-20.0, 0.0, 30.0), (160.0, 180.0, -150.0), (70.0, 90.0, 120.0), (0.0, 50.0)])

@@ -122,6 +122,9 @@ def test_new_results_take_the_place_of_all_former_ones(out: Path) -> None:
     write(out, {"b.txt": "mine"})  # a name that kgs writes is kgs's
     replace_all(out, NEW)
     assert contents(out) == NEW | MINE
+    (out / "test/notes.txt").unlink()
+    replace_all(out, {"a.txt": "new"})
+    assert not (out / "test").exists()
 
 
 def test_some_results_take_the_place_of_their_namesakes_alone(out: Path) -> None:
@@ -312,7 +315,7 @@ def test_no_command_replaces_a_file_of_the_user(
     assert os.listdir(tmp_path) == [name]
 
 
-@pytest.mark.parametrize(("words", "name"), FILES)
+@pytest.mark.parametrize(("words", "name"), [FILES[0], FILES[-1]])  # a splat, and a page
 def test_a_file_that_kgs_wrote_is_replaced_unless_it_is_one_of_a_fit(
     folder: Path, fitted: Path, tmp_path: Path, capsys: Any, words: str, name: str
 ) -> None:

@@ -1,7 +1,6 @@
 """What a user's folder may hold instead of photos that fit together: what happened, and what to do, is said."""
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -12,7 +11,7 @@ import pytest
 from command import run as command
 from init_point_scenes import cameras, texture
 from limits import limited
-from photo_folders import close, planes, write_photos, write_planes
+from photo_folders import close, notes_of, open_photos, planes, write_photos, write_planes
 
 from kgs._support.errors import DataError
 from kgs._support.progress import silent
@@ -20,7 +19,7 @@ from kgs.app.files.results import Results
 from kgs.app.sfm import pose, pose_photos
 from kgs.app.sfm.find import find_photos
 from kgs.app.sfm.pycolmap_processes import PycolmapProcesses
-from kgs.app.sfm.read import open_photos, read_photos
+from kgs.app.sfm.read import read_photos
 from kgs.app.sfm.source import Source
 
 pytest.importorskip("pycolmap")
@@ -67,15 +66,9 @@ def folder(tmp_path):
 VIDEO = b"\0\0\0\x18ftypisom" + bytes(100)
 FOLDERS = {  # what is in them, and what is said of it
     "notes": (lambda at: save(at, [], notes_txt=b"nothing"), ("expected photos", ".jpg", "Take 3 to 12 photos")),
-    "one": (lambda at: save(at, planes()[:1]), ("at least 3 photos, got 1", "Take 3 to 12")),
-    "too deep": (lambda at: save(at / "DCIM", planes()), ("these folders in it hold some: DCIM",)),
     "too deep, with cameras": (
         lambda at: save(save(at, [], transform_train_json=b"{}") / "images", planes()),
         ("these folders in it hold some: images", "transform_train.json"),
-    ),
-    "raw": (
-        lambda at: save(at, planes(), raw_dng=b"II*\0"),
-        ("got 1 of 4 of another kind (raw.dng)", "sips", "magick", "Most Compatible"),
     ),
     "video called JPEG": (
         lambda at: save(at, planes(), z_jpg=VIDEO),
@@ -142,7 +135,7 @@ def test_a_raw_file_beside_its_photo_is_passed_over(folder, heic, monkeypatch):
     for name in ("0.DNG", "1.dng", "2.HEIC"):
         (folder / name).write_bytes(b"II*\0")
     assert [path.name for path in find_photos(folder)] == ["0.png", "1.png", "2.png"]
-    said = " ".join(Source.unposed(folder).notes(None))
+    said = " ".join(notes_of(folder))
     for name in ("0.DNG", "1.dng", "2.HEIC"):
         assert name in said
 
@@ -155,7 +148,7 @@ def test_a_photo_is_taken_whatever_its_ending_is_called(folder, suffix):
     paths = find_photos(folder)
     assert paths[-1].name == f"3.{suffix}"
     assert len(read_photos(open_photos(paths), silent)) == 4
-    assert not Source.unposed(folder).notes(None)
+    assert not notes_of(folder)
 
 
 @pytest.mark.parametrize("suffix", ["avif", "JXL", "jp2", "gif", "pef", "ppm", "mpo"])
@@ -181,7 +174,7 @@ def test_what_looks_like_a_photo_and_is_not_taken_is_named(folder, refused):
     said = refused(folder.rename(folder.with_name("none")), "these folders in it hold some: more", "IMG_4", code=3)
     fill_with_odd_ones(save(folder, planes()))
     assert [path.name for path in find_photos(folder)] == ["0.png", "1.png", "2.png"]
-    said = " ".join(Source.unposed(folder).notes(None))
+    said = " ".join(notes_of(folder))
     for name in ("IMG_4", ".IMG_5.jpg", "IMG_6.jpg_original", "IMG_9.jpg", "more", "IMG_8.xmp"):
         assert name in said
     for name in ("IMG_7", "notes", "BM.txt", "empty"):
@@ -199,7 +192,7 @@ def test_masks_are_used_and_what_looks_like_one_is_no_photo(folder):
     photos = read_photos(open_photos(paths), silent)
     np.testing.assert_array_equal(photos[0].mask, mask)
     assert photos[1].mask is None
-    (note,) = Source.unposed(folder).notes(None)
+    (note,) = notes_of(folder)
     assert "1_mask.png" in note
 
 
@@ -208,11 +201,11 @@ def test_what_is_called_like_masks_and_is_not_used_is_named(folder):
     lone = ["0 (mask).png", "0_seg.png", "9_mask.png", "mask.png"]
     save(folder, [planes()[0]] * 4, lone)
     assert len(find_photos(folder)) == 7
-    unused, taken = Source.unposed(folder).notes(None)
+    unused, taken = notes_of(folder)
     assert "segmentation" in unused
     assert "--masks" in unused
     assert ", ".join(lone) in taken
-    assert Source.open(folder).notes(folder / "segmentation") == [taken]
+    assert notes_of(folder, folder / "segmentation") == [taken]
 
 
 def test_a_camera_that_only_turned(folder, refused):
@@ -232,15 +225,6 @@ def test_walking_forward(tmp_path, refused):
     images = planes(cameras(np.array([[0.02, 0.0, -0.2], [0.0, 0.02, 0.0], [-0.02, 0.0, 0.2]]), 0.01))
     text = refused(write_photos(tmp_path / "photos", images), "step sideways, not forward", "Matches of each pair")
     assert "places between" not in text
-
-
-def test_results_do_not_go_among_the_photos_or_over_another_scene(folder, tmp_path, refused):
-    write_planes(folder)
-    save(tmp_path / "other" / "images", planes())
-    for out in (folder, tmp_path / "other"):
-        before = sorted(out.rglob("*"))
-        refused(folder, "expected a new or empty folder", out=out, code=3)
-        assert sorted(out.rglob("*")) == before
 
 
 def test_photos_that_lie_where_results_go_are_refused(tmp_path, found):
@@ -274,37 +258,6 @@ def found(monkeypatch):
 
     monkeypatch.setattr(pose, "find_cameras", find)
     return counts
-
-
-@pytest.mark.parametrize(
-    "name", ["unfinished/notes.txt", "images/notes.txt", "images/deeper/IMG_1.HEIC", "sparse/0/deeper/a.bin", "a.jpg"]
-)
-def test_a_users_own_files_stay(folder, tmp_path, found, name):
-    """Also such as kgs does not read, when new photos take the place of the former ones."""
-    out = tmp_path / "project"
-    pose_photos(write_planes(folder), out)
-    (out / name).parent.mkdir(parents=True, exist_ok=True)
-    (out / name).write_bytes(b"mine")
-    (folder / "IMG_1.png").rename(folder / "IMG_4.png")
-    pose_photos(folder, out)
-    assert sorted(path.name for path in (out / "images").glob("*.png")) == ["IMG_2.png", "IMG_3.png", "IMG_4.png"]
-    assert (out / name).read_bytes() == b"mine"
-
-
-@pytest.mark.parametrize("lost", [".kgs*", ""])
-def test_a_copy_of_the_results_goes_on(folder, tmp_path, found, lost):
-    """Without hidden files, as `cp OUT/* COPY` makes it, nothing in it is known as a file of kgs: it is refused."""
-    pose_photos(write_planes(folder), tmp_path / "out")
-    copy = tmp_path / "copy"
-    shutil.copytree(tmp_path / "out", copy, ignore=shutil.ignore_patterns(lost), copy_function=shutil.copyfile)
-    if lost:
-        with pytest.raises(DataError, match=r"got one with images, photos\.json, sparse"):
-            pose_photos(folder, copy)
-        return
-    assert pose_photos(folder, copy)["reused"]
-    save(folder, planes()[:1, 20:], ["IMG_4.png"])
-    assert not pose_photos(folder, copy)["reused"]
-    assert len(list((copy / "images").iterdir())) == 4
 
 
 def test_other_masks_make_other_cameras(folder, tmp_path, found):

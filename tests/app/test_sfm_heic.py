@@ -5,11 +5,12 @@ import zlib
 
 import numpy as np
 import pytest
+from photo_folders import open_photos
 
 from kgs._support.errors import DataError
 from kgs._support.progress import silent
-from kgs.app.sfm.find import find_photos, notes_on
-from kgs.app.sfm.read import open_photos, read_photos
+from kgs.app.sfm.find import find_photos
+from kgs.app.sfm.read import read_photos
 from kgs.datasets import folders
 from kgs.datasets.image_file import ImageFile, is_heic
 
@@ -89,13 +90,6 @@ def test_without_the_extra_it_is_said_what_to_do(folder, monkeypatch):
         find_photos(folder)
     with pytest.raises(DataError, match=r"IMG_3\.jpg: .* got a HEIC photo or a video"):
         open_photos([folder / "IMG_3.jpg"])
-
-
-def test_of_a_photo_and_its_conversion_the_jpeg_is_taken(folder):
-    (folder / "img_2.jpg").write_bytes(PHOTO)  # what `magick mogrify` leaves beside IMG_2.HEIC
-    assert [path.name for path in find_photos(folder)] == ["IMG_1.heic", "IMG_3.jpg", "img_2.jpg"]
-    (note,) = notes_on(folder, find_photos(folder))
-    assert "IMG_2.HEIC" in note
 
 
 def test_a_folder_without_photos_names_the_endings_that_are_read(tmp_path, monkeypatch):

@@ -105,53 +105,6 @@ def test_pixels_become_square(tmp_path, aspect, size, name):
     assert np.ptp(rows) == pytest.approx(np.ptp(columns), abs=3)
 
 
-@pytest.mark.parametrize(("space", "width"), [("ITU601", 320), ("ITU709", 320), ("ITU709", 1280)])
-@pytest.mark.parametrize("full", [False, True])
-def test_colours_are_those_that_the_header_says(tmp_path, space, width, full):
-    """The matrix of BT.601 or 709, and the full or the limited range: OpenCV's work."""
-    av = pytest.importorskip("av")
-    reformatter = pytest.importorskip("av.video.reformatter")
-    matrix = reformatter.Colorspace[space]
-    scale = reformatter.ColorRange.JPEG if full else reformatter.ColorRange.MPEG
-    path = tmp_path / "clip.mp4"
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=10)
-        stream.width, stream.height, stream.pix_fmt = width, width * 9 // 16, "yuv420p"
-        number = 1 if space == "ITU709" else 6
-        stream.codec_context.colorspace = stream.codec_context.color_primaries = stream.codec_context.color_trc = number
-        stream.codec_context.color_range = 2 if full else 1
-        picture = np.full((width * 9 // 16, width, 3), (200, 60, 30), np.uint8)
-        frame = av.VideoFrame.from_ndarray(picture, "rgb24")
-        frame = frame.reformat(format="yuv420p", dst_colorspace=matrix, src_color_range=2, dst_color_range=scale)
-        for packet in [*stream.encode(frame), *stream.encode()]:
-            container.mux(packet)
-    with _Reader(path) as reader:
-        found = reader.read(0)
-    np.testing.assert_allclose(found[..., ::-1].mean((0, 1)), [200, 60, 30], atol=4)
-
-
-@pytest.mark.parametrize("code", ["mp4v", "VP80"])
-def test_frames_keep_all_rows(tmp_path, code):
-    """Where columns have no texture, too, as in a picture without noise; and rows may be stripes."""
-    video = tmp_path / ("clip.mp4" if code == "mp4v" else "clip.avi")
-    rows = np.arange(SIZE[1])[:, None]
-    background = np.broadcast_to(np.where(rows < 120, rows, 120 + 60 * (rows % 2)), SIZE[::-1]).astype(np.uint8)
-    disc = np.hypot(rows - 120, np.arange(SIZE[0]) - 160) < 80
-    wall = texture(0, (220.0, 220.0, 220.0)).astype(np.uint8)
-    writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*code), 30, SIZE)
-    assert writer.isOpened()
-    for i in range(40):
-        shown = np.roll(wall, -2 * i, axis=1)[: SIZE[1], : SIZE[0]]
-        writer.write(np.where(disc[..., None], shown, background[..., None]))
-    writer.release()
-    take(video, 3)
-    for path in video.with_suffix("").iterdir():
-        frame = cv2.imread(str(path)).astype(int)
-        assert frame.shape[1::-1] == SIZE
-        stripes = frame[130:230, :40].mean((1, 2))
-        assert np.abs(np.diff(stripes)).min() > 20
-
-
 def broken(path: Path) -> Path:
     video = write_video(path, [0.0, 5.0, 10.0])
     video.write_bytes(video.read_bytes()[:200])

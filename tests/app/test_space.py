@@ -5,7 +5,6 @@ import os
 import re
 import sys
 import time
-import zlib
 from pathlib import Path
 from unittest.mock import MagicMock
 
@@ -13,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from photo_folders import write_planes
+from tiny_scenes import png_of
 
 pytest.importorskip("PIL")
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="the machines that it is for have process groups")
@@ -149,16 +149,11 @@ def test_photos_that_are_too_large(app, photos, monkeypatch, limit):
     assert "Expected " in last(app, photos)[0]
 
 
-def bomb():
-    """A PNG whose header claims more pixels than any photo has."""
-    data = bytearray(cv2.imencode(".png", np.zeros((4, 4, 3), np.uint8))[1].tobytes())
-    data[16:24] = (60000).to_bytes(4, "big") * 2
-    data[29:33] = zlib.crc32(data[12:29]).to_bytes(4, "big")
-    return bytes(data)
+BOMB = png_of(b"", 60_000, 60_000)  # its header claims more pixels than any photo has
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b"GIF89a" + bytes(40), b"<html><script>alert(1)</script>", b"\xff\xd8\xff", bomb()]
+    "content", [b"", b"GIF89a" + bytes(40), b"<html><script>alert(1)</script>", b"\xff\xd8\xff", BOMB]
 )
 def test_what_is_no_photo(app, photos, content):
     photos[2].write_bytes(content)

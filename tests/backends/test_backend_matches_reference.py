@@ -6,12 +6,23 @@ import math
 import pytest
 import torch
 from compositing_checks import TH, THRESHOLDS, assert_close, exact, footprints, outcome, random, sample
-from factories import FIELDS, batch, random_camera, random_gaussians, random_model, replace, with_camera
+from factories import (
+    FIELDS,
+    LENS_PARAMS,
+    batch,
+    posed,
+    random_camera,
+    random_gaussians,
+    random_model,
+    replace,
+    with_camera,
+)
 from kornia.losses import ssim_loss
+from kornia.sensors.camera import CameraModelType
 from projection_checks import assert_alike, wide_scene
-from targets import TRITON, on_kernels
+from targets import TORCH, TRITON, on_kernels
 
-from kgs import project
+from kgs import GaussianRenderer, project
 from kgs.backends import BACKENDS
 from kgs.losses import photometric_loss, target_moments
 
@@ -224,6 +235,19 @@ def test_compositing(kernels, case):
     if case is unseen or not len(projected):
         assert (found[0][1] == 1).all()
         assert not any(x.any() for x in (found[0][0], found[0][2], *found[1]))
+
+
+# -- projection in torch and compositing: what has no projection in kernels -------------------------------------------
+
+
+@on_kernels({}, {kind.name: kind for kind in CameraModelType})
+def test_render_through_a_lens(kernels, case):
+    gaussians, images = random_gaussians(kernels.few(100, 12), 2, torch.float32, 1), []
+    for target, dtype in ((kernels, torch.float32), (TORCH, torch.float64)):
+        lens = target.move(torch.tensor(LENS_PARAMS[case]), dtype)
+        camera = posed(case, lens, extrinsics=target.move(torch.eye(4)[None], dtype))
+        images.append(GaussianRenderer(backend=target.backend)(target.move(gaussians, dtype), camera).image.cpu())
+    assert (images[0] - images[1]).abs().max() <= 1e-5 * images[1].abs().max()
 
 
 # -- loss ----------------------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 import pickle
 from dataclasses import replace
+from typing import get_args
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ from kgs import RasterOptions, backends
 from kgs.backends import get_backend
 from kgs.backends.self_check import BOUND, EVERYTHING, FITS, largest_error
 from kgs.fit.adam import Adam
+from kgs.fit.config import Backend as BackendName
 from kgs.init_points.matching import match
 from kgs.losses import photometric_loss, target_moments
 
@@ -38,6 +40,10 @@ def half(monkeypatch):
 def render(width, backend, **options):
     gaussians = random_gaussians(30, 0, sh_degree=None)
     return kgs.GaussianRenderer(backend=backend, **options)(gaussians, random_camera(8, width, 0)).image
+
+
+def test_a_command_and_a_fit_take_every_name():
+    assert set(get_args(BackendName)) == set(backends.available())
 
 
 def test_auto_is_the_first_that_covers_the_call_and_torch_does_the_rest(half):

@@ -1,28 +1,12 @@
 """Compositing against closed forms, and median depth."""
 
-import math
-
 import pytest
 import torch
-from compositing_checks import DTYPES, EXACT, footprints, leaves
-from factories import one_gaussian, pinhole
-from oracles import theta_mass
+from compositing_checks import DTYPES, EXACT, STOP, TH, footprints, leaves
 
-from kgs import GaussianRenderer, RasterOptions, composite
+from kgs import RasterOptions, composite
 
 pytestmark = pytest.mark.usefixtures("each_backend")
-
-
-@pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 1e-6), (torch.float64, 1e-13)])
-@pytest.mark.parametrize("scale", [0.01, 0.2, 1.0])
-def test_isotropic_gaussian_on_the_axis_is_the_closed_form(dtype, bound, scale):
-    camera, color = pinhole(21, 27, 30.0, dtype=dtype), torch.tensor([0.2, 0.5, 1.0], dtype=torch.float64)
-    gaussians = one_gaussian((scale,) * 3, (0.3, -0.5, 0.1, 0.7), (0.0, 0.0, 2.0), 0.8, color.tolist(), dtype)
-    out = GaussianRenderer(alpha_threshold=0, transmittance_stop=0)(gaussians, camera, outputs=("image", "alpha"))
-    y, x = torch.meshgrid(torch.arange(21.0) - 10, torch.arange(27.0) - 13, indexing="ij")
-    expected = 0.8 * torch.exp(-(x * x + y * y).double() / (2 * ((30.0 * scale / 2.0) ** 2 + 0.3)))
-    assert (out.alpha[0, 0] - expected).abs().max() <= bound
-    assert (out.image[0] - expected * color[:, None, None]).abs().max() <= bound
 
 
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 3e-6), (torch.float64, 1e-13)])
@@ -38,29 +22,6 @@ def test_anisotropic_footprints_are_the_explicit_quadratic_form(dtype, bound):
         d = pixels - centre.double()
         expected = 1 - 0.7 * torch.exp(-0.5 * torch.einsum("pi,ij,pj->p", d, inverse, d))
         assert (got.reshape(-1) - expected).abs().max() <= bound
-
-
-@pytest.mark.parametrize("variance", [0.3, 0.5, 2.0, 9.0])
-@pytest.mark.parametrize("centre", [(20.0, 20.0), (20.5, 19.75), (19.9, 20.31)])
-def test_mass_is_the_theta_function(variance, centre):
-    sigma = math.sqrt(variance)
-    alone = footprints([0.5], [centre], [[[sigma, 0, 0], [0, sigma, 0]]], size=(41, 41))
-    mass = 1 - composite(alone, alone.colors, options=EXACT).transmittance
-    assert mass.sum().item() == pytest.approx(
-        0.5 * theta_mass(variance, centre[0]) * theta_mass(variance, centre[1]), rel=1e-9
-    )
-    nome = math.exp(-2 * math.pi**2 * variance)
-    assert mass.sum().item() == pytest.approx(math.pi * variance, rel=4 * nome * (1 + nome) + 1e-6)
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_three_layers_by_hand(dtype):
-    colors = torch.tensor([[1.0, 0.0, 0.25], [0.0, 1.0, 0.5], [0.5, 0.5, 1.0]], dtype=dtype)
-    layers = footprints([0.5, 0.25, 0.9], depths=[3.0, 1.0, 2.0], dtype=dtype)  # order: 1, 2, 0
-    out = composite(layers, colors)
-    expected = 0.25 * colors[1] + 0.75 * 0.9 * colors[2] + 0.75 * 0.1 * 0.5 * colors[0]
-    assert (out.features - expected[None, :, None, None]).abs().max() <= 1e-6
-    assert (out.transmittance - 0.75 * 0.1 * 0.5).abs().max() <= 1e-7
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -95,3 +56,51 @@ def test_median_depth_is_only_made_when_asked_for_and_has_no_gradient():
     found = composite(projected, inputs[-1], median_depth=True).median_depth
     assert found.shape == (1, 1, 3, 4)
     assert not found.requires_grad
+
+
+# -- rules -----------------------------------------------------------------------------------------------------------
+
+
+def test_stop_is_inclusive():
+    # T behind two layers of 0.99 is 9.99998e-5 in float32 and 1.0000000000000002e-4 in float64: both must count them
+    white = {}
+    for dtype in DTYPES:
+        out = composite(footprints([0.99, 0.99], dtype=dtype), torch.eye(2, 3, dtype=dtype))
+        assert (out.features[0, :2, 0, 0].double() - torch.tensor([0.99, 0.0099])).abs().max() <= 1e-6
+        white[dtype] = (out.features[:, :2].sum(1) + out.transmittance[:, 0]).double()
+    assert (white[torch.float32] - white[torch.float64]).abs().max() <= STOP + 1e-6
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("stop", [0.02, 0.05, 0.5])
+def test_light_of_exactly_the_stop_is_the_border(stop, dtype):
+    exact = [(stop, True)] if stop == 0.5 else []  # the others are rounded
+    for left, counts in [(stop * (1 - 1e-4), False), (stop * (1 + 1e-4), True), *exact]:
+        out = composite(
+            footprints([1 - left, 0.5], dtype=dtype),
+            torch.eye(2, dtype=dtype),
+            options=RasterOptions(transmittance_stop=stop),
+        )
+        assert (out.features[0, 1] - 0.5 * left * counts).abs().max() <= 1e-6
+        assert not out.transmittance.any()
+
+
+def test_a_layer_counts_from_the_threshold_on():
+    for opacity, drawn in ((TH * (1 - 1e-5), False), (TH * (1 + 1e-5), True)):
+        layer = footprints([opacity], dtype=torch.float32)
+        assert bool((composite(layer, layer.colors).transmittance < 1).all()) is drawn
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("opacity", [0.98, 0.995, 1.3])
+def test_clamp_of_alpha_and_its_exact_gradient(opacity, dtype):
+    alpha, slope = min(opacity, 0.99), float(opacity < 0.99)
+    projected, inputs = leaves(footprints([opacity, 0.5], dtype=dtype), torch.tensor([[1.0], [3.0]], dtype=dtype))
+    out = composite(projected, inputs[-1])
+    assert (out.features - (alpha + 3 * 0.5 * (1 - alpha))).abs().max() <= 1e-6
+    (out.features.sum() + 7 * out.transmittance.sum()).backward()
+    pixels = 12
+    # d/da of  a + 3 (1 - a) / 2 + 7 (1 - a) / 2,  and of the layer behind
+    expected = [slope * pixels * (1 - 1.5 - 3.5), pixels * (1 - alpha) * (3 - 7)]
+    assert (inputs[2].grad - torch.tensor(expected, dtype=dtype)).abs().max() <= 1e-4
+    assert (inputs[3].grad[:, 0] - torch.tensor([alpha, 0.5 * (1 - alpha)]) * pixels).abs().max() <= 1e-5

@@ -4,11 +4,10 @@ import dataclasses
 
 import pytest
 import torch
-from compositing_checks import DTYPES, STOP, TH, footprints, leaves, scene_footprints
-from factories import random_camera, random_gaussians, staged
-from oracles import near_threshold
+from compositing_checks import DTYPES, STOP, TH, leaves, scene_footprints
+from factories import staged
 
-from kgs import RasterOptions, backends, composite, project
+from kgs import backends, composite
 from kgs.backends.torch import compositing
 from kgs.backends.torch.binning import bin_to_tiles
 
@@ -31,77 +30,14 @@ def assert_gradients_close(got, expected, bound):
         assert (a.double() - b.double()).abs().max() <= bound * b.abs().max()
 
 
-@pytest.mark.parametrize("thresholds", [(0.0, 0.0), (TH, STOP)])
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_tile_and_chunk_sizes_give_one_image_and_gradient(dtype, thresholds):
-    options = dict(zip(("alpha_threshold", "transmittance_stop"), thresholds, strict=True))
-    gaussians = random_gaussians(300, 5, dtype, image_size=40)
-    camera = random_camera(40, 56, 5, dtype)
-    certain = ~near_threshold(gaussians, camera, *thresholds)
-    with torch.no_grad():
-        projected = project(gaussians, camera, options=RasterOptions(alpha_threshold=thresholds[0]))
-    weights = torch.randn(1, 4, 40, 56, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    weights = (weights * certain).to(dtype)
-    first, first_gradients = loss_and_gradients(
-        projected, projected.colors, weights, tile_size=4, chunk_size=1, **options
-    )
-    for tile_size, chunk_size in ((4, None), (5, 3), (8, 32), (64, 3)):
-        image, gradients = loss_and_gradients(
-            projected, projected.colors, weights, tile_size=tile_size, chunk_size=chunk_size, **options
-        )
-        # the exponent is a polynomial about the tile's centre: its rounding grows with the tile's area
-        bound = 1e-6 * max(1.0, (tile_size / 16) ** 2) if dtype == torch.float32 else 1e-12
-        assert ((image - first).abs() * certain).max() <= bound
-        assert_gradients_close(gradients, first_gradients, 5 * bound)
-
-
-def dense(means2d, factors, opacities, features, depths, size, eps2d):
-    """Every footprint at every pixel, with the default thresholds: sums of features and transmittance, by autograd."""
-    order = depths.argsort(stable=True)
-    covariances = factors @ factors.mT + eps2d * torch.eye(2, dtype=factors.dtype)
-    d = torch.cartesian_prod(*map(torch.arange, size)).flip(1) - means2d[:, None]
-    squared = torch.einsum("npi,nij,npj->np", d, torch.linalg.inv(covariances), d)
-    alphas = (opacities[:, None] * torch.exp(-0.5 * squared)).clamp(max=0.99)[order]
-    alphas = torch.where(alphas >= TH, alphas, 0.0)
-    transmittance = torch.cumprod(torch.cat([torch.ones_like(alphas[:1]), 1 - alphas]), 0)
-    transmittance = torch.where(transmittance >= STOP, transmittance, 0.0)
-    sums = torch.einsum("np,nf->fp", alphas * transmittance[:-1], features[order])
-    return torch.cat([sums, transmittance[-1:]]).view(1, -1, *size)
-
-
-@pytest.mark.parametrize(("chunk_size", "max_bytes"), [(1, 2**30), (3, 2**19), (None, 2**30), (None, 2**19)])
-def test_tiles_that_end_at_different_depths(chunk_size, max_bytes):
-    # veils over all, and an opaque curtain for each column of tiles at another depth: tiles end one after the other
-    size, columns, veils = (20, 72), 9, 120
-    generator = torch.Generator().manual_seed(0)
-    walls = [(8 * c + 3.5, 10.0, 12.0 * (c * 4 % columns) + 0.5) for c in range(columns - 1)] * 8
-    centres = [(72 * x, 20 * y) for x, y in torch.rand(veils, 2, generator=generator).tolist()]
-    centres += [(x, y) for x, y, _ in walls]
-    curtain = torch.tensor([[5.0, 0, 0], [0, 60, 0]])
-    factors = torch.cat([25 * torch.eye(2, 3).expand(veils, 2, 3), curtain.expand(len(walls), 2, 3)])
-    factors = factors + torch.randn(factors.shape, generator=generator)
-    opacities = torch.cat([0.01 + 0.02 * torch.rand(veils, generator=generator), torch.full((len(walls),), 0.98)])
-    depths = torch.cat([torch.arange(veils), torch.tensor([z for *_, z in walls])])
-    projected = footprints(opacities, centres, factors, depths, size, eps2d=0.3)
-    colors = torch.rand(len(depths), 3, generator=generator, dtype=torch.float64)
-    weights = torch.randn(1, 4, *size, generator=generator, dtype=torch.float64)
-    image, gradients = loss_and_gradients(projected, colors, weights, chunk_size=chunk_size, max_bytes=max_bytes)
-    _, inputs = leaves(projected, colors)
-    expected = dense(*inputs, projected.depths, size, 0.3)
-    assert (expected[:, 3] == 0).double().mean() > 0.3
-    assert (expected[:, 3] > 0.05).double().mean() > 0.05
-    assert (image - expected).abs().max() <= 1e-12
-    assert_gradients_close(gradients, torch.autograd.grad((expected * weights).sum(), inputs), 1e-10)
-
-
 @pytest.fixture
 def composited(monkeypatch):
-    """The depth slices that are composited from here on, and whether their alphas were kept."""
+    """The depth slices that are composited from here on."""
     slices, real = [], compositing.DepthSlice.composite
 
-    def noted(part, canvas, keep, keep_alphas):
-        slices.append((part, keep_alphas))
-        return real(part, canvas, keep, keep_alphas)
+    def noted(part, *arguments):
+        slices.append(part)
+        return real(part, *arguments)
 
     monkeypatch.setattr(compositing.DepthSlice, "composite", noted)
     return slices
@@ -134,23 +70,6 @@ def test_byte_budget_changes_nothing(dtype, composited):
     assert_gradients_close(tight_gradients, free_gradients, 1e-6 if dtype == torch.float32 else 1e-13)
 
 
-@pytest.mark.parametrize("dtype", [pytest.param(DTYPES[0], marks=pytest.mark.slow), *DTYPES[1:]])
-def test_alphas_made_again_are_those_that_were_kept(dtype, composited, monkeypatch):
-    settings = dataclasses.replace(compositing.SETTINGS["cpu"], pairs=2**12)  # steps that fit whatever the budget
-    monkeypatch.setitem(compositing.SETTINGS, "cpu", settings)
-    projected, colors, weights = scene_footprints(300, 1, dtype, image_size=40)
-    kept, kept_gradients = loss_and_gradients(projected, colors, weights)
-    assert all(keep_alphas for _, keep_alphas in composited)
-    budget = 2**24
-    while any(keep_alphas for _, keep_alphas in composited):  # until there is room for the lists alone
-        composited.clear()
-        budget = int(0.8 * budget)
-        lean, lean_gradients = loss_and_gradients(projected, colors, weights, max_bytes=budget)
-    assert len(composited) == 1
-    assert torch.equal(lean, kept)
-    assert all(torch.equal(*pair) for pair in zip(lean_gradients, kept_gradients, strict=True))
-
-
 @pytest.mark.parametrize(("dtype", "bound", "tight"), [(torch.float32, 1e-6, False), (torch.float64, 1e-13, True)])
 @pytest.mark.parametrize(
     "thresholds", [*(pytest.param(pair, marks=pytest.mark.slow) for pair in ((0.0, 0.0), (TH, STOP))), (TH, 0.1)]
@@ -169,7 +88,7 @@ def test_depth_slices_change_nothing(dtype, bound, thresholds, tight, composited
     settings = dataclasses.replace(compositing.SETTINGS["cpu"], layers=layers)
     monkeypatch.setitem(compositing.SETTINGS, "cpu", settings)
     layered, layered_gradients = loss_and_gradients(projected, colors, weights, **options)
-    entries = [len(part.lists.entries) for part, _ in composited]
+    entries = [len(part.lists.entries) for part in composited]
     assert len(entries) > (6 if tight else 3)
     if thresholds[1] == 0.1:  # what lies behind the stop is not listed
         assert sum(entries) < 0.9 * (2 if tight else 1) * len(bin_to_tiles(projected).entries)

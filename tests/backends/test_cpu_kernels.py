@@ -20,7 +20,7 @@ from kgs._support.compiled.lanes import WIDTH, load, store  # noqa: E402  # need
 from kgs.backends.cpu import binning_kernels, loss_kernels, projection_kernels  # noqa: E402  # needs numba
 from kgs.backends.cpu import compositing_kernels as kernels  # noqa: E402  # needs numba
 from kgs.backends.cpu.binning import TileCoverage  # noqa: E402  # needs numba
-from kgs.init_points import matching_kernels  # noqa: E402  # needs numba
+from kgs.init_points import matching_kernels, sweep_kernels  # noqa: E402  # needs numba
 
 
 @pytest.fixture(autouse=True)
@@ -121,16 +121,6 @@ def test_strips_are_found_that_are_reached_by_a_rounding():
         assert not alphas[~found].any()
 
 
-def test_a_strip_beside_the_ellipse_is_not_found():
-    rows = np.zeros((kernels.K, kernels.ROW), np.float32)
-    rows[:, 3] = rows[:, 6] = 1.0  # alpha is 2^-(dx^2 + dy^2)
-    rows[0, 2] = -3.5 + 1.99  # the last row of the first strip is less than a pixel above, the next less than 3 below
-    rows[1, 1], rows[1, 2] = 5.6, -3.5  # 2.1 beside the tile
-    rows[2, 1] = 5.4
-    found, _ = find_strips(rows, 3, 2.0**-4)
-    assert found.tolist() == [[True, True, False, False], [False] * 4, [False, True, True, False]]
-
-
 def test_strips_are_found_whatever_is_not_finite():
     for column, bad in itertools.product(range(7), (np.nan, np.inf, -np.inf, 3e38, -3e38)):
         rows = layers_of_a_chunk(0, kernels.K)
@@ -161,23 +151,35 @@ def test_pixels_are_the_lanes(kernel):
     assert packed > max(24, 1.5 * scalar)  # forward has 33 with AVX-512 and twice as many with AVX2
 
 
-IMAGE, MAPS = nb.float32[:, :, ::1], nb.float32[:, :, :, ::1]
-TAPS, SUMS = nb.types.UniTuple(nb.float32, 6), nb.float64[:, ::1]
+ROWS, IMAGE, MAPS = nb.float32[:, ::1], nb.float32[:, :, ::1], nb.float32[:, :, :, ::1]
+NUMBERS, SUMS = nb.float32[::1], nb.float64[:, ::1]
+LENGTHS = [nb.types.UniTuple(nb.float32, count) for count in range(7)]
+FOUND = (nb.float32, NUMBERS, NUMBERS, nb.int64[::1], ROWS, ROWS, nb.int64[:, ::1])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "arguments", "operations"),  # of the loops over columns, in the source
+    ("kernel", "arguments", "pattern", "operations"),  # of the loops over columns, planes or descriptors, in the source
     [
-        ("ssim_maps", (TAPS, IMAGE, IMAGE, IMAGE, IMAGE, MAPS, SUMS), 90),
-        ("ssim_gradient", (TAPS, IMAGE, IMAGE, MAPS, IMAGE), 26),
-        ("total_gradient", (IMAGE, IMAGE, IMAGE, nb.float32, nb.float32, IMAGE), 6),
+        (loss_kernels.ssim_maps, (LENGTHS[6], *[IMAGE] * 4, MAPS, SUMS), "add|sub|mul", 90),
+        (loss_kernels.ssim_gradient, (LENGTHS[6], IMAGE, IMAGE, MAPS, IMAGE), "add|sub|mul", 26),
+        (loss_kernels.total_gradient, (*[IMAGE] * 3, nb.float32, nb.float32, IMAGE), "add|sub|mul", 6),
+        (
+            sweep_kernels.compare_tiles,
+            (ROWS, SUMS, ROWS, LENGTHS[3], IMAGE, nb.float64[:, :, :, ::1], IMAGE),
+            "add|sub",
+            32,
+        ),
+        (sweep_kernels.add_paths, (IMAGE, ROWS, nb.int64, nb.int64, LENGTHS[4], IMAGE), "add|sub|min|cmp", 9),
+        (matching_kernels.find_nearest, (*[ROWS] * 4, *FOUND), "sub", 1),
+        (matching_kernels.find_nearest, (*[ROWS] * 4, *FOUND), "add|mul|fm", 1),
+        (matching_kernels.find_nearest, (*[ROWS] * 4, *FOUND), "and", 1),
     ],
 )
-def test_loops_over_columns_are_vector_code(name, arguments, operations):
+def test_inner_loops_are_vector_code(kernel, arguments, pattern, operations):
     """All that they compute stands in the assembly for whole AVX registers; single numbers are what is left over."""
-    assembly = avx_assembly(getattr(loss_kernels, name), nb.int64, nb.int64, *arguments)
-    assert len(re.findall(r"\bv\w*(?:add|sub|mul)\w*ps\b.*[yz]mm", assembly)) >= operations
+    assembly = avx_assembly(kernel, nb.int64, nb.int64, *arguments)
+    assert len(re.findall(rf"\bv\w*(?:{pattern})\w*p[sd]\b.*[yz]mm", assembly)) >= operations
 
 
 def stamp(kernel):

@@ -1,7 +1,6 @@
 """Compositing of kernels: what torch gives in float64."""
 
 import dataclasses
-import weakref
 
 import pytest
 import torch
@@ -15,10 +14,9 @@ from compositing_checks import (
     sample,
 )
 from refusals import refused
-from targets import SELDOM_INTERPRETED, TORCH, Target
+from targets import SELDOM_INTERPRETED, TORCH
 
 from kgs import ArgumentError, RasterOptions, composite
-from kgs.backends.gpu import compositing
 
 
 @pytest.fixture
@@ -51,27 +49,6 @@ def test_row_slices_change_nothing(kernels, width):
         assert_close(sliced, whole, certain, 2e-6)
     with refused(ArgumentError, name="max_bytes"):
         outcome(projected, features, certain, kernels, max_bytes=500 if few else 3000)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kernels", [Target("triton")], indirect=True)
-def test_row_slices_are_kept_within_max_bytes_and_freed_when_they_are_used(kernels, monkeypatch):
-    """In the backward pass too; those that are not kept are made again."""
-    projected, certain = sample(10, (24, 9))
-    made, real = [], compositing.GpuCompositor._composite_rows
-
-    def composite_rows(self, rows, *arguments):
-        held = sum(x.nbytes for reference in made if (x := reference()) is not None)
-        assert held + self._bytes(rows, compositing._PER_ENTRY) <= max_bytes
-        lists = real(self, rows, *arguments)
-        made.extend(weakref.ref(x) for x in (lists.entries, lists.slots, lists.starts))
-        return lists
-
-    monkeypatch.setattr(compositing.GpuCompositor, "_composite_rows", composite_rows)
-    for max_bytes, times in ((6000, 2), (5000, 4), (4096, 5)):  # both kept, neither, the first of three
-        made.clear()
-        outcome(projected, random(len(projected), 3), certain, kernels, max_bytes=max_bytes)
-        assert len(made) / 3 == times
 
 
 def test_only_what_is_wanted_is_differentiated(kernels, scene):

@@ -3,9 +3,9 @@
 import pytest
 import torch
 from factories import footprints
-from tile_checks import THRESHOLD, check_structure, dots, listed, scene
+from tile_checks import THRESHOLD, check_structure, listed, scene
 
-from kgs.backends.torch.binning import bin_to_tiles
+from kgs.backends.torch.binning import TileCoverage, bin_to_tiles
 
 
 def needles(seed, ratio, size=(45, 67)):
@@ -88,27 +88,6 @@ def test_a_single_pixel_just_above_the_threshold_is_enough(width, length):
     assert torch.isin(reachable.nonzero()[:, 0], last).all()
 
 
-def test_a_dot_is_in_the_tiles_around_it_only():
-    """Alpha 0.9 falls to 1/255 at sqrt(0.6 ln(229.5)) = 1.806 px: by hand, from one tile to two and to four."""
-    size = (32, 32)
-    for (x, y), tiles in {
-        (3.0, 3.0): [0],
-        (6.19, 3.0): [0],
-        (6.2, 3.0): [0, 1],
-        (7.5, 7.5): [0, 1, 4, 5],
-        (8.8, 3.0): [0, 1],
-        (8.81, 3.0): [1],
-        (3.0, 6.2): [0, 4],
-        (31.0, 31.0): [15],
-        (-1.8, 3.0): [0],
-        (-1.81, 3.0): [],
-        (32.8, 3.0): [3],
-        (32.81, 3.0): [],
-        (3.0, 34.0): [],
-    }.items():
-        assert listed(dots([x, y], size), bin_to_tiles(dots([x, y], size))).nonzero()[:, 1].tolist() == tiles
-
-
 def test_threshold_zero_is_every_tile_of_the_own_camera():
     projected = scene(0, cameras=3)
     bins = bin_to_tiles(projected, 8, 0.0)
@@ -138,3 +117,50 @@ def test_many_ties_and_negative_depths():
             projected.means2d, projected.factors, projected.opacities, projected.image_size, depths=depths
         )
         check_structure(tied, bin_to_tiles(tied))
+
+
+# -- slices ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("max_spans", [2**40, 100, 1])
+@pytest.mark.parametrize("share", [1.0, 0.5, 0.1, 0.0])
+def test_row_slices_cover_all_rows_within_the_budget_and_together_are_the_whole(share, max_spans):
+    projected = scene(0, cameras=3)
+    coverage, whole = TileCoverage(projected, 8, THRESHOLD, max_spans), bin_to_tiles(projected, 8)
+    needs = [
+        5 * spans + 7 * entries for spans, entries in zip(coverage.spans_per_row, coverage.entries_per_row, strict=True)
+    ]
+    budget = max(int(share * sum(needs)), max(needs))
+    slices = coverage.row_slices(budget, 5, 7)
+    assert [begin for begin, _ in slices] == [0, *(end for _, end in slices[:-1])]
+    assert slices[-1][1] == 3 * whole.grid[0]
+    assert all(begin < end for begin, end in slices)
+    assert len(slices) == 1 if share == 1 else len(slices) > 1
+    parts = []
+    for begin, end in slices:
+        spans = coverage.spans(begin, end)
+        part = coverage.lists(spans, begin, end)
+        check_structure(projected, part)
+        assert 5 * len(spans.ranks) + 7 * len(part.entries) <= budget
+        assert (part.first_tile, part.num_tiles) == (begin * whole.grid[1], (end - begin) * whole.grid[1])
+        assert (part.tile_size, part.grid) == (8, whole.grid)
+        parts.append(part)
+    entries = torch.cat([part.ids[part.entries.long()] for part in parts])
+    assert torch.equal(entries, whole.ids[whole.entries.long()])
+    assert torch.equal(torch.cat([part.offsets.diff() for part in parts]), whole.offsets.diff())
+
+
+@pytest.mark.parametrize("max_spans", [2**40, 100])
+@pytest.mark.parametrize("layers", [1, 3, 10, 1000])
+def test_depth_slices_cover_all_ranks_in_about_equal_parts(layers, max_spans):
+    projected = scene(0, cameras=2)
+    coverage, whole = TileCoverage(projected, 8, THRESHOLD, max_spans), bin_to_tiles(projected, 8)
+    slices, rows = coverage.depth_slices(layers), (0, 2 * whole.grid[0])
+    assert slices == TileCoverage(projected, 8, THRESHOLD).depth_slices(layers)
+    assert [begin for begin, _ in slices] == [0, *(end for _, end in slices[:-1])]
+    assert slices[-1][1] == len(whole.ids)
+    assert all(begin < end for begin, end in slices)
+    entries = [len(coverage.lists(coverage.spans(*rows), *rows, ranks).entries) for ranks in slices]
+    assert sum(entries) == len(whole.entries)
+    largest = int(torch.bincount(whole.entries).max())  # a slice ends between two Gaussians
+    assert max(entries) <= max(len(whole.entries) / len(slices), layers * whole.num_tiles) * 1.5 + 2 * largest

@@ -12,7 +12,7 @@ from kornia.geometry.camera import PinholeCamera
 import kgs
 from kgs.bench import speed
 from kgs.bench.scenes import layered_scene
-from kgs.bench.speed import Cases, _exponent, _with_target
+from kgs.bench.speed import Cases, _exponent
 from kgs.bench.timing import busy_processes, take_turns, time_parts
 
 
@@ -126,8 +126,3 @@ def test_busy_processes_end_with_the_block(monkeypatch):
     with busy_processes(2):
         assert [process.poll() for process in started] == [None, None]
     assert None not in [process.poll() for process in started]
-
-
-def test_ratios_stand_with_their_targets():
-    assert _with_target(4.26, "training step", 10_000, ".1f") == "4.3; 4"
-    assert _with_target(4.26, "training step", 300, ".1f") == "4.3"

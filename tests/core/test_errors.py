@@ -87,6 +87,16 @@ def bad_call_of_gsplat(name, dtype):
     return name, TypeError, call
 
 
+def bad_matrices(name, error, value):
+    """Of `pinhole_cameras`."""
+
+    def call():
+        given = {"viewmats": torch.eye(4), "Ks": torch.eye(3), "width": 32, "height": 24, name: value}
+        kgs.pinhole_cameras(**given)
+
+    return name, error, call
+
+
 def bad_stage(name, error, features=None, **changes):
     """Of compositing."""
 
@@ -211,6 +221,7 @@ CASES = [
     ("cameras", TypeError, lambda: kgs.project(random_gaussians(3, 0, torch.float32).to("meta"), camera())),
     bad_argument("gaussians", TypeError, None),
     ("gaussians", TypeError, lambda: kgs.project([random_gaussians(3, 0)], camera())),
+    bad_argument("gaussians", TypeError, lambda: random_model(3)),
     *each("opacities", ValueError, lambda shape: drawn_with_rows_of_opacities(*shape), (2, 1), (1, 3), (2, 3)),
     # cameras
     *each("cameras", TypeError, image_size, None, torch.eye(4)),
@@ -222,6 +233,14 @@ CASES = [
     ("extrinsics", TypeError, lambda: posed(CameraModelType.PINHOLE, extrinsics=torch.eye(4)[None].tolist())),
     *each("extrinsics", ValueError, camera_with_extrinsics, (4, 4), (1, 3, 4), (1, 1, 4, 4)),
     ("model", ValueError, lambda: posed(CameraModelType.PINHOLE, torch.ones(2, 4).double(), cameras=3)),
+    bad_matrices("viewmats", TypeError, [1]),
+    bad_matrices("viewmats", ValueError, torch.eye(3)),
+    bad_matrices("Ks", TypeError, torch.eye(3).double()),
+    *[bad_matrices("Ks", ValueError, value) for value in (torch.eye(2), torch.eye(3).repeat(2, 1, 1))],
+    bad_matrices("width", ValueError, 0),
+    bad_matrices("height", ValueError, 2.5),
+    bad_matrices("pixel_centers", ValueError, "centre"),
+    ("extrinsics", ValueError, lambda: camera_with_extrinsics((0, 4, 4))),
     # gsplat's call
     *[bad_call_of_gsplat(name, None) for name in (*FIELDS, "viewmats", "Ks")],
     *[
@@ -379,16 +398,6 @@ def test_an_argument_becomes_an_entry_of_a_file():
     error = ArgumentError("fit", "an object", 3, advice="fit again")
     assert str(error.about("a.json")) == "a.json: fit: expected an object, got 3: fit again"
     assert str(error.about("a.json", "")) == "a.json: expected an object, got 3: fit again"
-
-
-def test_a_model_in_place_of_its_gaussians_is_told_to_be_called():
-    with pytest.raises(TypeError, match="expected Gaussians, got GaussianModel; call the module"):
-        kgs.GaussianRenderer()(random_model(3), camera())
-
-
-def test_means_of_another_shape_are_not_told_their_own_count():
-    with pytest.raises(ValueError, match=re.escape("means: expected shape (N, 3), got (3, 7)")):
-        with_fields(random_gaussians(7, 0), means=torch.zeros(3, 7, dtype=torch.float64))
 
 
 def test_the_first_cause_of_an_error_is_a_line():

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from factories import other_defaults, pinhole
+from factories import pinhole
 from factories import random_cloud as cloud
 from factories import random_model as model
 from refusals import refused
@@ -134,16 +134,6 @@ def test_a_scale_beyond_the_dtype_has_gradient_zero_and_the_others_theirs(dtype,
         assert all(bool(torch.isfinite(p.grad).all()) for p in made.parameters() if p.grad is not None)
         assert made.log_scales.grad[1, 0] == 0
     assert torch.equal(scales[0], made.log_scales[0].exp())
-
-
-def test_default_device_and_default_dtype_do_not_reach_a_model():
-    points, colors = cloud()
-    expected = GaussianModel.from_points(points, colors).state_dict()
-    with other_defaults():
-        made = GaussianModel.from_points(points, colors)
-        made.load_state_dict(made.state_dict())
-        assert made().colors.dtype == torch.float32
-    assert all(torch.equal(value, expected[name]) for name, value in made.state_dict().items())
 
 
 def test_antialiased_is_kept_by_what_makes_another_model():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from factories import other_defaults, pinhole, random_model, splat_columns
+from factories import pinhole, random_model, splat_columns
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
@@ -79,7 +79,7 @@ UTM = torch.tensor([448262.127, 5411932.678, 118.5], dtype=torch.float64)  # met
 
 
 @pytest.mark.parametrize(("offset", "dtype"), [(None, np.float32), (UTM, np.float64)], ids=["floats", "doubles"])
-def test_trimesh_reads_all_columns(tmp_path, offset, dtype):
+def test_convention_trimesh_reads_all_columns(tmp_path, offset, dtype):
     model = small_model()
     save_ply(tmp_path / "a.ply", model, offset)
     raw = trimesh.load(tmp_path / "a.ply").metadata["_ply_raw"]["vertex"]["data"]
@@ -279,14 +279,3 @@ def test_a_failed_write_leaves_the_file_behind_a_link_and_no_other(tmp_path, mon
     assert (tmp_path / "link.ply").is_symlink()
     assert same(load_ply(tmp_path / "far" / name), random_model())
     assert [entry.name for entry in (tmp_path / "far").iterdir()] == [name]
-
-
-def test_default_device_and_default_dtype_do_not_reach_the_file(tmp_path):
-    model = random_model()
-    save_ply(tmp_path / "a.ply", model, torch.ones(3))
-    with other_defaults():
-        save_ply(tmp_path / "b.ply", model, torch.ones(3, device="cpu"))
-        again = load_ply(tmp_path / "b.ply", origin=torch.ones(3, device="cpu"))
-    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
-    assert again.means.device.type == "cpu"
-    assert again.means.dtype == torch.float32

@@ -1,6 +1,5 @@
 """Normals, features and backgrounds of the renderer."""
 
-import contextlib
 import math
 
 import pytest
@@ -10,8 +9,6 @@ from kornia.sensors.camera import CameraModelType
 
 import kgs
 from kgs import GaussianRenderer
-from kgs.backends import BACKENDS
-from kgs.stages import blend
 
 pytestmark = pytest.mark.usefixtures("each_backend")
 
@@ -56,19 +53,6 @@ def test_normals_have_gradients():
     assert torch.autograd.gradcheck(normal, small.quats.clone().requires_grad_(), fast_mode=True)
 
 
-@pytest.mark.parametrize("width", [1, 2, 5])
-def test_features_of_any_width_are_drawn_as_colours_are(width):
-    gaussians, camera = random_scene(0, torch.float64, 60, SIZE, None)
-    features = torch.randn(60, width, dtype=torch.float64)
-    background = torch.randn(width, dtype=torch.float64)
-    out = GaussianRenderer()(replace(gaussians, colors=features), camera, background, outputs=("image", "depth"))
-    assert out.image.shape == (1, width, *SIZE)
-    assert torch.equal(out.depth, GaussianRenderer()(gaussians, camera, outputs=("depth",)).depth)
-    for i in range(width):
-        one = replace(gaussians, colors=features[:, i : i + 1].expand(60, 3))
-        assert torch.allclose(out.image[:, i], GaussianRenderer()(one, camera, background[i].expand(3)).image[:, 0])
-
-
 @pytest.mark.parametrize("shape", [(3,), (1, 3), (3, *SIZE), (1, 3, *SIZE)])
 def test_an_infinite_background_shows_only_where_light_is_left(shape):
     wall = [one_gaussian((50.0, 50.0, 0.01), mean=(0.0, 0.0, z), opacity=0.99) for z in (3.0, 4.0, 5.0)]
@@ -84,17 +68,3 @@ def test_an_infinite_background_shows_only_where_light_is_left(shape):
     assert not background.grad.any()
     nothing = kgs.Gaussians(*(x.detach()[:0] for x in inputs))
     assert (GaussianRenderer()(nothing, camera, background).image == math.inf).all()
-
-
-@pytest.mark.parametrize("rounding", [contextlib.nullcontext(), torch.autocast("cpu", torch.bfloat16)])
-def test_one_color_behind_an_image_is_added_as_torch_adds_it(rounding):
-    image, transmittance = torch.rand(2, 3, 5, 7, requires_grad=True), torch.rand(2, 1, 5, 7, requires_grad=True)
-    color = torch.rand(3)
-    weights = torch.rand(2, 3, 5, 7)
-    found = blend(image, transmittance, color, BACKENDS["torch"])
-    expected = torch.addcmul(image, transmittance, color[:, None, None])
-    assert torch.equal(found, expected)
-    with rounding:
-        mine = torch.autograd.grad((found * weights).sum(), (image, transmittance))
-        same = torch.autograd.grad((expected * weights).sum(), (image, transmittance))
-    torch.testing.assert_close(mine, same)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import kgs._support.memory
-from kgs._support.memory import array, empty
+from kgs._support.memory import array
 
 LARGE = (1000, 100)
 
@@ -59,13 +59,6 @@ def test_threads_do_not_get_the_same_memory():
 
     with ThreadPoolExecutor(4) as pool:
         assert list(pool.map(work, range(4))) == [0, 1, 2, 3]
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.int64])
-def test_tensors_are_like_the_one_that_is_given(dtype):
-    like = torch.zeros(3, dtype=dtype)
-    values = empty(LARGE, like)
-    assert (values.shape, values.dtype, values.device) == (torch.Size(LARGE), dtype, like.device)
 
 
 def test_what_is_kept_is_bounded(monkeypatch):

@@ -134,16 +134,6 @@ def trainer(tmp_path):
     return runner, (gaussians, camera, k)
 
 
-def test_gsplats_simple_trainer_draws(tmp_path):
-    runner, (gaussians, camera, k) = trainer(tmp_path)
-    poses = camera.extrinsics.inverse()
-
-    def draw():
-        return runner.rasterize_splats(poses, k, SIZE[1], SIZE[0], sh_degree=1)[0]
-
-    check_drops(draw, runner.drop, as_is(gaussians, camera, k))
-
-
 def test_gsplats_simple_trainer_trains(tmp_path, monkeypatch):
     loader = torch.utils.data.DataLoader
     monkeypatch.setattr(torch.utils.data, "DataLoader", lambda views, shuffle, **_: loader(views, shuffle=shuffle))
@@ -218,39 +208,3 @@ def test_splatfacto(splatfacto):
     assert model.info["means2d"].shape == (1, 60, 2)
     step_cb(model, SimpleNamespace(optimizers={}), 15_000)
     assert drop.progress == 0.5
-
-
-def test_the_papers_release():
-    source = peer("DropGaussian_release", "gaussian_renderer", "__init__.py")
-    lines = source.splitlines()
-    begin = next(i for i, line in enumerate(lines) if line.strip() == "if is_train:")
-    end = next(i for i in range(begin, len(lines)) if "compensation[:, None]" in lines[i])
-    new = [
-        "    if is_train:",
-        "        drop.progress = min(1.0, iteration / 10_000)",
-        "        opacity = drop(opacity)",
-    ]
-    drop, seen = kgs.DropGaussian(p=0.2, seed=0), []
-
-    def rasteriser(**given):
-        seen.append(given["opacities"])
-        return torch.zeros(3, *SIZE), torch.ones(60)
-
-    names = {"drop": drop, "GaussianRasterizationSettings": SimpleNamespace}
-    names["GaussianRasterizer"] = lambda raster_settings: rasteriser
-    whole = "\n".join([*lines[:begin], *new, *lines[end + 1 :]])
-    render = function(whole, "render", {}, names)
-    gaussians, _, _ = scene()
-    model = SimpleNamespace(get_xyz=gaussians.means, get_opacity=gaussians.opacities[:, None], active_sh_degree=1)
-    model.get_scaling, model.get_rotation, model.get_features = gaussians.scales, gaussians.quats, gaussians.colors
-    view = SimpleNamespace(FoVx=1.0, FoVy=0.8, image_height=SIZE[0], image_width=SIZE[1], camera_center=torch.zeros(3))
-    view.world_view_transform = view.full_proj_transform = torch.eye(4)
-    pipe = SimpleNamespace(compute_cov3D_python=False, convert_SHs_python=False, debug=False)
-    render(view, model, pipe, torch.zeros(3), is_train=True, iteration=5000)
-    assert drop.rate == 0.1
-    kept = seen[0] != 0
-    assert seen[0].shape == (60, 1)
-    assert 0 < (~kept).sum() < 20
-    assert torch.allclose(seen[0][kept], (gaussians.opacities[:, None] / 0.9)[kept])
-    render(view, model, pipe, torch.zeros(3), is_train=False)
-    assert torch.equal(seen[1], gaussians.opacities[:, None])

@@ -7,16 +7,11 @@ import pytest
 import torch
 from init_point_scenes import as_views
 from refusals import refused
-from yard import yard_from_above
 
 from kgs import ArgumentError
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.border import find_border_mask
-from kgs.fit.config import FitConfig
-from kgs.fit.plan import make_plan
-from kgs.fit.run import choose_points
 from kgs.fit.targets import targets
-from kgs.fit.trainer import Trainer
 from kgs.losses import photometric_loss
 from kgs.metrics.evaluate import evaluate
 
@@ -31,17 +26,6 @@ def behind(left=1.0, top=2.0, right=0.5, bottom=0.0):
     rows, columns = torch.arange(1.0, 145.0)[:, None], torch.arange(1.0, 193.0)
     sides = columns - left, columns.flip(0) - right, rows - top, rows.flip(0) - bottom
     return math.prod(side.clamp(0, 1) for side in sides)
-
-
-@pytest.mark.slow
-def test_a_border_is_found_as_it_is(scene):
-    light = behind()
-    found = find_border_mask(scene.train.images * light)
-    assert bool((found[4:-4, 4:-4] == 1).all())
-    torch.testing.assert_close(found, light, atol=0.4, rtol=0)  # at corners of a textured scene
-    assert float((found - light).abs()[light < 1].mean()) < 0.05
-
-    assert find_border_mask(scene.train.images[:2] * light) is not None
 
 
 def test_a_border_of_changing_thickness_is_followed(scene):
@@ -87,23 +71,6 @@ def test_a_border_has_no_part_in_a_fit(scene):
     photometric_loss(target.as_photographed(render), target.image, 0.2, moments=target.moments).backward()
     assert bool((render.grad[0, :, light == 0] == 0).all())
     assert bool((render.grad[0, :, light == 1] != 0).any())
-
-
-@pytest.mark.slow
-def test_a_fit_renders_the_scene_without_the_border(scene):
-    """A fit that knows of the border is as bright at the edge as one of photos without; else it is dark there."""
-    views, _ = yard_from_above((144, 192))
-    scene = replace(scene, train=views, test=views.select([0]))
-    light, points = behind(left=3.0, top=0.0, right=0.0), choose_points(scene, FitConfig(init="sift"))
-    edges = []
-    for views in (scene, with_border(scene, light), with_border(scene, light, known=False)):
-        trainer = Trainer(
-            views, make_plan(views, FitConfig(steps=200, evaluations=1, training_background="scene"), points), points
-        )
-        trainer.fit()
-        edges.append(float(trainer.result().render(scene.train.camera(0))[..., :2].mean()))
-    assert edges[1] == pytest.approx(edges[0], abs=0.1)
-    assert edges[2] < edges[1] - 0.1
 
 
 def test_a_render_is_compared_as_the_photo_shows_it(scene):

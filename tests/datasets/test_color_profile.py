@@ -10,11 +10,12 @@ import cv2
 import numpy as np
 import PIL.Image
 import pytest
+from photo_folders import open_photos
 from PIL import ImageCms
 from tiny_scenes import png_chunk, read_image, write_colmap
 
 from kgs._support.progress import silent
-from kgs.app.sfm.read import open_photos, read_photos
+from kgs.app.sfm.read import read_photos
 from kgs.datasets import load_scene
 from kgs.datasets.image_file import ImageFile, color_notes
 
@@ -101,12 +102,6 @@ def test_alpha_stays_and_16_bits_are_converted_too(tmp_path: Path) -> None:
     chunk = png_chunk(b"iCCP", b"P3\0\0" + zlib.compress(p3_profile()))
     (tmp_path / "deep.png").write_bytes(data[:33] + chunk + data[33:])  # behind the header
     np.testing.assert_array_equal(read_image(tmp_path / "deep.png"), image[..., :3])
-
-
-def test_unposed_photos_are_converted(tmp_path: Path) -> None:
-    paths = [save(tmp_path / f"{i}.png", p3_profile(), np.roll(patches(), 16 * i, axis=0)) for i in range(3)]
-    for i, photo in enumerate(read_photos(open_photos(paths), silent)):
-        np.testing.assert_allclose(photo.pixels, srgb_of_p3(np.roll(patches(), 16 * i, axis=0)), atol=1.5)
 
 
 def exif(space: int | None, index: str = "", more: dict[int, object] | None = None) -> PIL.Image.Exif:
@@ -220,14 +215,6 @@ def test_what_a_png_says_of_colours(tmp_path: Path, kind: str) -> None:
     np.testing.assert_allclose(read_image(tmp_path / "a.png") * 255, expected, atol=1.5 if "profile" in kind else 0.1)
 
 
-def test_a_profile_of_grey(tmp_path: Path) -> None:
-    levels = np.arange(256, dtype=np.uint8).reshape(16, 16)
-    for name in ("a.png", "a.jpg", "a.tif"):
-        path = save(tmp_path / name, grey_profile(1.8), levels)
-        stored = cv2.imread(str(path))
-        np.testing.assert_allclose(read_image(path) * 255, to_srgb(stored, None, 1.8), atol=1.5)
-
-
 def test_both_readers_say_what_they_doubt(tmp_path: Path) -> None:
     write_colmap(tmp_path)
     photo = next((tmp_path / "images").iterdir())
@@ -243,7 +230,7 @@ def test_other_profiles_leave_every_bit_alone(tmp_path: Path, kind: str) -> None
         "none": b"",
         "sRGB": ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes(),
         "damaged": p3_profile()[:200],
-        "grey": p3_profile().replace(b"RGB ", b"GRAY", 1),
+        "grey": grey_profile(1.8),
     }[kind]
     levels = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (40, 50, 3), np.uint8), (0, 0), 1)
     np.testing.assert_array_equal(read_image(save(tmp_path / "a.png", profile, levels)), levels / np.float32(255))

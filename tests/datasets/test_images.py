@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from tiny_scenes import read_image
 
-from kgs._support.errors import DataError
 from kgs.datasets.folders import image_folder, list_images
 from kgs.datasets.images import Intrinsics, rectification, remap, resize
 
@@ -37,24 +36,12 @@ def undistort(image: np.ndarray, given: Intrinsics) -> tuple[np.ndarray, Intrins
     return remap(image, maps), pinhole
 
 
-def test_colours_come_as_rgb(tmp_path: Path) -> None:
+def test_convention_colours_come_as_rgb(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), np.full((2, 3, 3), (255, 51, 0), np.uint8))  # blue, green, red
     image = read_image(tmp_path / "a.png")
     assert image.shape == (2, 3, 3)
     assert image.dtype == np.float32
     np.testing.assert_array_equal(image[0, 0], np.array([0, 0.2, 1], np.float32))
-
-
-@pytest.mark.parametrize("suffix", [".png", ".webp"])
-@pytest.mark.parametrize("kept", [0.0, 0.5, 0.98])
-def test_a_truncated_image_is_named(tmp_path: Path, suffix: str, kept: float) -> None:
-    noise = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)
-    path = tmp_path / f"cut{suffix}"
-    cv2.imwrite(str(path), noise)
-    assert read_image(path).shape == (40, 60, 3)
-    path.write_bytes(path.read_bytes()[: int(kept * path.stat().st_size)])
-    with pytest.raises(DataError, match=r"cut\."):
-        read_image(path)
 
 
 def test_folders(tmp_path: Path) -> None:

@@ -52,7 +52,7 @@ def test_each_photo_has_its_own_camera(tmp_path: Path, layout: str) -> None:
 
 @EACH
 @pytest.mark.parametrize("downscale", [None, 2])
-def test_a_dot_is_where_the_camera_sees_its_point(tmp_path: Path, layout: str, downscale: int | None) -> None:
+def test_convention_a_dot_is_where_a_camera_sees_its_point(tmp_path: Path, layout: str, downscale: int | None) -> None:
     """The half pixel: a dot is drawn where the format puts the point, and found where Kornia's camera puts it."""
     write, lens = LAYOUTS[layout]
     step = downscale or 1

@@ -7,7 +7,7 @@ from refusals import refused
 
 from kgs._support.errors import DataError
 from kgs.datasets.folders import list_images
-from kgs.datasets.mask_files import find_mask_files
+from kgs.datasets.masks import find_masks
 
 CAMERAS = ("images/cam0/0.jpg", "images/cam1/0.jpg")
 PLAIN = ("images/IMG_0.jpg", "images/IMG_1.jpg", "images/IMG_2.jpg")
@@ -40,7 +40,7 @@ def test_masks_are_used_or_counted(
 ) -> None:
     paths = write(tmp_path, *photos)
     write(tmp_path, *used.values(), *lost)
-    files = find_mask_files(paths, tmp_path)
+    files = find_masks(paths, tmp_path)
     assert files.masks == {paths[k]: tmp_path / name for k, name in used.items()}
     assert sorted(files.lost) == sorted(tmp_path / name for name in lost)
     assert not files.unused
@@ -58,7 +58,7 @@ FOLDERS = ["mask", "Masks", "segmentation", "Person_Masks", "images/mattes"]
 def test_what_looks_like_a_mask_is_named_and_not_used(tmp_path: Path, name: str) -> None:
     paths = write(tmp_path, *PLAIN)
     (other,) = write(tmp_path, name)
-    files = find_mask_files(paths, tmp_path)
+    files = find_masks(paths, tmp_path)
     in_a_folder = other.parent.name != "images"
     assert not files.masks
     assert files.unused == [other.parent if in_a_folder else other]
@@ -69,14 +69,14 @@ def test_what_looks_like_a_mask_is_named_and_not_used(tmp_path: Path, name: str)
 
 def test_what_does_not_look_like_a_mask_is_a_photo(tmp_path: Path) -> None:
     paths = write(tmp_path, "persons_unmasked/mask_0.jpg", "persons_unmasked/a.jpg", "persons_unmasked/a.jpg.jpg")
-    assert find_mask_files(paths, tmp_path) == ({}, [], [])
+    assert find_masks(paths, tmp_path) == ({}, [], [])
     assert len(list_images(tmp_path / "persons_unmasked")) == 3
 
 
 def test_a_folder_that_is_named_is_the_only_one(tmp_path: Path) -> None:
     paths = write(tmp_path, *PLAIN)
     (mask, other, *_) = write(tmp_path, "mine/IMG_0.png", "mine/IMG_1.gif", "masks/IMG_1.png", "segmentation/IMG_2.png")
-    assert find_mask_files(paths, tmp_path, tmp_path / "mine") == ({paths[0]: mask}, [other], [])
+    assert find_masks(paths, tmp_path, tmp_path / "mine") == ({paths[0]: mask}, [other], [])
 
 
 @pytest.mark.parametrize(
@@ -95,4 +95,4 @@ def test_masks_that_are_refused(tmp_path: Path, masks: tuple[str, ...], folder: 
     paths = write(tmp_path, *PLAIN, *CAMERAS)
     write(tmp_path, *masks)
     with refused(DataError, path=tmp_path / wrong, key=""):
-        find_mask_files(paths, tmp_path, None if folder is None else tmp_path / folder)
+        find_masks(paths, tmp_path, None if folder is None else tmp_path / folder)

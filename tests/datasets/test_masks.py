@@ -1,8 +1,6 @@
 """Masks of photos: read, resized with the photo; what they leave out is ignored, or empty."""
 
-import os
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,13 +12,8 @@ from tiny_scenes import update_json, write_colmap, write_llff, write_nerfstudio
 
 from kgs._support.errors import DataError
 from kgs.datasets import load_scene
-from kgs.datasets.mask_files import find_mask_files
 from kgs.datasets.scene import Views
-from kgs.fit.config import FitConfig
-from kgs.fit.measures import measure
-from kgs.fit.run import fit_scene
 from kgs.fit.targets import targets
-from kgs.init_points.tracks import detect
 from kgs.metrics.evaluate import evaluate, mean_psnr
 
 LEFT = np.zeros((12, 16), np.uint8)
@@ -82,18 +75,6 @@ def test_black_is_looked_away_from(tmp_path: Path, write: str | Callable[[Path],
     assert scene.train.alphas is None
 
 
-@pytest.mark.parametrize("name", ["0_mask.png", "0.png.png", "dynamic_mask_0.png"])
-def test_what_looks_like_masks_among_photos_is_named_and_no_photo(tmp_path: Path, name: str) -> None:
-    """In a layout that takes all photos of a folder."""
-    write_llff(tmp_path)
-    write_mask(tmp_path / "images" / name)
-    scene = load_scene(tmp_path, hold_out=0)
-    assert len(scene.train) == 3
-    assert scene.train.valid_mask is None
-    (note,) = scene.notes
-    assert name in note
-
-
 def test_a_photo_that_a_scene_names_may_look_like_a_mask(tmp_path: Path) -> None:
     write_nerfstudio(tmp_path)
     (tmp_path / "images" / "1.png").rename(tmp_path / "images" / "0_mask.png")
@@ -113,30 +94,6 @@ def test_white_is_the_largest_value_of_a_mask(tmp_path: Path, kind: type[np.uint
     assert [float(kept.float().mean()) for kept in valid] == [0.5, 1, 1]
 
 
-@pytest.mark.parametrize(("kind", "value"), [(np.uint8, 0), (np.uint8, 1), (np.uint16, 255)])
-def test_a_mask_of_one_value_is_refused_with_it(tmp_path: Path, kind: type[np.uint8], value: int) -> None:
-    write_llff(tmp_path)
-    path = write_mask(tmp_path / "masks" / "0.png", np.full((12, 16), value, kind))
-    with pytest.raises(DataError, match=rf"\b{value} everywhere") as error:
-        load_scene(tmp_path, hold_out=0)
-    assert error.value.path == path
-
-
-def test_masks_of_photos_that_are_gone_are_counted(tmp_path: Path) -> None:
-    """Of a model whose photo was deleted, and of one that it has not registered."""
-    write_colmap(tmp_path)
-    for name in ("0", "1", "2", "other"):
-        write_mask(tmp_path / "masks" / f"{name}.png")
-    (tmp_path / "images" / "1.png").unlink()
-    cv2.imwrite(str(tmp_path / "images" / "other.png"), LEFT)
-    scene = load_scene(tmp_path, hold_out=0)
-    assert scene.train.names == ("0.png", "2.png")
-    assert scene.train.valid_mask is not None
-    (note,) = (note for note in scene.notes if "fit no photo" in note)
-    assert "masks/1.png" in note
-    assert "masks/other.png" in note
-
-
 def test_black_is_not_there(tmp_path: Path) -> None:
     write_llff(tmp_path)
     write_mask(tmp_path / "others" / "0.png")
@@ -148,16 +105,6 @@ def test_black_is_not_there(tmp_path: Path) -> None:
     plain = load_scene(tmp_path, hold_out=0)
     assert plain.train.valid_mask is None
     assert torch.equal(plain.train.images[0, :, :, 8:], scene.train.images[0, :, :, 8:])
-
-
-def test_metrics_say_which_pixels_were_compared(tmp_path: Path) -> None:
-    write_llff(tmp_path)
-    config = FitConfig(steps=1, evaluations=1, init="random", init_points=20)
-    fit = fit_scene(load_scene(tmp_path, hold_out=0), config)
-    assert "all pixels" in measure(fit)["protocol"]["psnr"]
-    write_mask(tmp_path / "masks" / "0.png")
-    masked = replace(fit, scene=load_scene(tmp_path, hold_out=0))
-    assert "the pixels that count" in measure(masked)["protocol"]["psnr"]
 
 
 def test_a_mask_is_reduced_with_its_photo(tmp_path: Path) -> None:
@@ -186,25 +133,6 @@ def test_photos_that_are_missing_are_named_beside_masks_too(tmp_path: Path) -> N
         load_scene(tmp_path, hold_out=0)
 
 
-def test_the_folder_of_photos_is_listed_as_often_for_many_masks_as_for_few(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A model may have registered few of the photos whose masks are there."""
-    seen: list[int] = []
-    for count in (3, 30):
-        root = tmp_path / str(count)
-        for k in range(count):
-            write_mask(root / "images" / f"{k}.png")
-            write_mask(root / "masks" / f"{k}.png")
-        scans: list[object] = []
-        real = os.scandir
-        monkeypatch.setattr(os, "scandir", lambda path, scans=scans, real=real: scans.append(path) or real(path))
-        assert len(find_mask_files([root / "images" / "0.png"], root).masks) == 1
-        monkeypatch.undo()
-        seen.append(len(scans))
-    assert seen[0] == seen[1] > 0
-
-
 @pytest.fixture
 def half() -> Views:
     """Three views of which the left half does not count."""
@@ -212,12 +140,6 @@ def half() -> Views:
     valid = torch.ones(views.images[:, 0].shape, dtype=torch.bool)
     valid[:, :, : valid.shape[2] // 2] = False
     return Views(views.cameras, views.images, views.names, valid_mask=valid)
-
-
-def test_no_keypoint_lies_where_no_pixel_counts(half: Views) -> None:
-    pixels, _ = detect(half, 0, 1000)
-    assert len(pixels) > 50
-    assert float(pixels[:, 0].min()) >= half.images.shape[-1] // 2 - 1
 
 
 def test_the_loss_has_no_gradient_where_no_pixel_counts(half: Views) -> None:

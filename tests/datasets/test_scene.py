@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from factories import other_defaults
 from kornia.geometry.camera import PinholeCamera
 from tiny_scenes import write_blender, write_colmap, write_llff, write_nerfstudio
 from torch.utils.data import DataLoader
@@ -56,14 +55,6 @@ def test_views_are_a_data_set_of_dicts():
     assert "alpha" not in synthetic_scene(train_views=1, test_views=0, size=(6, 8)).train[0]
 
 
-def test_comparing_does_not_raise():
-    scene, again = (synthetic_scene(train_views=1, test_views=1, size=(6, 8)) for _ in range(2))
-    assert scene == scene  # what is tested
-    assert scene != again
-    assert scene.train != again.train
-    assert len({scene, again, scene}) == 2
-
-
 @pytest.mark.parametrize("workers", [0, 1])
 def test_torchs_loader_makes_batches_of_views(workers):
     given = synthetic_scene(train_views=5, test_views=1, size=(6, 8)).train
@@ -79,61 +70,7 @@ def test_torchs_loader_makes_batches_of_views(workers):
     assert sorted(seen) == [0, 1, 2, 3, 4]
 
 
-@pytest.mark.parametrize(
-    ("index", "rows"),
-    [
-        *[(one, [1]) for one in (1, -1, np.int64(1), np.uint8(1), torch.tensor(1), [np.int32(1)], (1,))],
-        *[(several, [1, 0]) for several in ([1, 0], np.array([1, 0]), torch.tensor([1, 0]))],
-    ],
-)
-def test_cameras_by_any_kind_of_integers(index, rows):
-    given = views(6, 8)
-    given.cameras.extrinsics[1, 0, 3] = 7.0
-    chosen = given.camera(index)
-    assert torch.equal(chosen.extrinsics, given.cameras.extrinsics[rows])
-    assert chosen.batch_size == len(rows)
-
-
-@pytest.mark.parametrize(
-    ("index", "error"),
-    [(other, TypeError) for other in (0.0, np.float32(1), [0.5], True, torch.tensor([True, False]))]
-    + [(outside, IndexError) for outside in (2, -3, [0, 5])],
-)
-def test_cameras_by_other_things_and_those_that_are_not_there(index, error):
-    with pytest.raises(error, match="index"):
-        views(6, 8).camera(index)
-
-
 WRITERS = pytest.mark.parametrize("write", [write_llff, write_colmap, write_blender, write_nerfstudio])
-
-
-@WRITERS
-def test_scenes_are_float32_on_the_cpu_whatever_the_defaults(tmp_path, write):
-    write(tmp_path)
-    with other_defaults():
-        check_float32(load_scene(tmp_path, downscale=2))
-
-
-def test_synthetic_scenes_are_float32_on_the_cpu_whatever_the_defaults():
-    with other_defaults():
-        check_float32(synthetic_scene(train_views=1, test_views=1, size=(6, 8)))
-
-
-def check_float32(scene):
-    for part in (
-        scene.train,
-        scene.test,
-        scene.train.downsample(2),
-        *([scene.train_full_size] if scene.train_full_size else []),
-    ):
-        tensors = [part.images, part.cameras.intrinsics, part.cameras.extrinsics, part.cameras.fx]
-        tensors += [] if part.alphas is None else [part.alphas]
-        assert part.cameras.height.device.type == part.camera([0]).width.device.type == "cpu"
-        assert {(tensor.dtype, tensor.device.type) for tensor in tensors} == {(torch.float32, "cpu")}
-        assert part.select([0]).images.device.type == "cpu"
-    assert {t.dtype for t in (scene.points, scene.point_colors, scene.background)} == {torch.float32}
-    assert scene.offset.dtype == torch.float64
-    assert scene.points.device.type == scene.offset.device.type == "cpu"
 
 
 @WRITERS

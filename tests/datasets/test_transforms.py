@@ -55,7 +55,7 @@ def check_undistorted(root: Path, coefficients: tuple[float, ...], fisheye: bool
 
 
 @BOTH
-def test_instant_ngps_fisheye(tmp_path: Path, layout: str) -> None:
+def test_convention_fisheye_of_instant_ngp_is_opencvs(tmp_path: Path, layout: str) -> None:
     write(tmp_path, layout, {**LENS, "is_fisheye": True, "k1": 0.05, "k2": -0.02, "k3": 0.01, "k4": 0.002, "p1": 0})
     check_undistorted(tmp_path, (0.05, -0.02, 0.01, 0.002), fisheye=True)
 

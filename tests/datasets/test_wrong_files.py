@@ -141,7 +141,7 @@ MODEL, CAMERAS, IMAGES, RIGS, FRAMES, POINTS = (
 COLMAP = [
     (CAMERAS, text("OPENCV", "FOV"), f"{CAMERAS}: camera 1"),
     (CAMERAS, text(" 14.0 14.5 ", " 14.0 "), f"{CAMERAS}: camera 1"),
-    (CAMERAS, text(" 14.0 14.5 ", " fourteen 14.5 "), f"{CAMERAS}: line '1 OPENCV"),
+    (CAMERAS, text(" 14.0 14.5 ", " fourteen 14.5 "), f"{CAMERAS}: camera 1: "),
     (CAMERAS, text(" 14.0 14.5 ", " -14 14.5 "), f"{IMAGES}: 0.png"),
     (CAMERAS, text(" 14.0 14.5 ", " nan 14.5 "), f"{IMAGES}: 0.png"),
     (CAMERAS, text(" 0.001 -0.001", " 0.001 inf"), f"{IMAGES}: 0.png"),
@@ -150,7 +150,7 @@ COLMAP = [
     (CAMERAS, content(b"\xe9"), f"{CAMERAS}: "),
     (IMAGES, text(" 1 2.png", " 1 ../2.png"), f"{IMAGES}: '../2.png'"),
     (IMAGES, text(" 1 2.png", " 1 0.png"), f"{IMAGES}: 0.png: expected each image once"),
-    (IMAGES, text(" 1 2.png", " one 2.png"), f"{IMAGES}: line '3 "),
+    (IMAGES, text(" 1 2.png", " one 2.png"), f"{IMAGES}: image: "),
     (IMAGES, text("\n3 ", "\n2 "), f"{IMAGES}: image 2"),
     (IMAGES, text(r"\n3 \S+ \S+ \S+ \S+ ", "\n3 0 0 0 0 "), f"{IMAGES}: 2.png"),
     (IMAGES, text(r"\n3 \S+", "\n3 nan"), f"{IMAGES}: 2.png"),

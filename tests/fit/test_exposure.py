@@ -10,7 +10,6 @@ from refusals import refused
 from trainers import settled
 
 from kgs import ArgumentError, GaussianModel, GaussianRenderer, RasterOptions
-from kgs.app.page import fit_page
 from kgs.datasets import synthetic_scene
 from kgs.fit import Fit
 from kgs.fit.config import PRESETS, FitConfig
@@ -21,7 +20,6 @@ from kgs.fit.plan import make_plan
 from kgs.fit.pruning import psnr_per_view
 from kgs.fit.run import fit_scene
 from kgs.fit.targets import targets
-from kgs.fit.trainer import Trainer
 from kgs.init_points import InitialPoints
 from kgs.init_points.patches import MIN_PATCHES, PatchColors
 from kgs.metrics.evaluate import clipped_psnr, color_corrected, evaluate
@@ -210,28 +208,6 @@ def test_a_background_that_shows_through_is_not_exposed_in_any_measure(see_throu
     assert clipped_psnr(metrics["color_corrected"]["psnr"]) > 60, "the colours of the scene alone are fitted"
     again = measure_again(see_through.annotated(metrics=metrics), Path("metrics.json"))
     assert again["train"] == metrics["train"]
-
-
-def test_a_background_that_shows_through_is_not_exposed_in_the_curve_and_in_pictures(see_through):
-    scene = see_through.scene
-    bare = replace(scene, train=replace(scene.train, gains=None))
-    decisions = Decisions(exposure=ExposureDecision(scene.train.gains.tolist(), 0.1, 500))
-    points = InitialPoints(see_through.model.means.detach(), torch.full((60, 3), 0.5), "dense")
-    plan = make_plan(bare, see_through.settings, points)
-    trainer = Trainer(bare, replace(plan, decisions=decisions), points)
-    trainer.state.model.load_state_dict(see_through.model.state_dict())
-    trainer._measure_curve()
-    assert clipped_psnr(trainer.state.curve[0]["train_psnr"]) > 80
-    assert trainer.state.curve[0]["test_psnr"] < 40
-    for view, target in enumerate(targets(scene.train, scene.background, torch.device("cpu"))):
-        own = GaussianRenderer()(
-            see_through.model(), target.camera, target.background_before_gain(scene.background)
-        ).image
-        seen = scene.train.as_photo(view, scene.train.render(view, see_through.render))
-        torch.testing.assert_close(seen, target.as_photographed(own).detach(), atol=1e-6, rtol=0)
-    with_metrics = see_through.annotated(metrics=measure(see_through))
-    for i, picture in enumerate(fit_page._pictures([scene.train], {"": with_metrics}, fit_page._kept_image)):
-        torch.testing.assert_close(picture.renders[""], scene.train.images[i], atol=1e-5, rtol=0)
 
 
 def test_recoloured_renders_fit_best():

@@ -46,17 +46,3 @@ def test_points_of_somebody_else_are_not_taken_for_those_of_the_photos(tiny):
 def test_random_points_of_a_layout_are_those_of_the_scene():
     assert used_init("scene", "random") == "scene"
     assert used_init("dense", "model-points") == "model-points"
-
-
-def test_each_view_is_rendered_once_for_all_measures(tiny, monkeypatch):
-    fit = fit_scene(tiny, replace(CONFIG, init="random", prune=True))
-    cameras = []
-    render = fit.test_renders._render
-    monkeypatch.setattr(fit.test_renders, "_render", lambda *given: cameras.append(given) or render(*given))
-    monkeypatch.setattr(fit.train_renders, "_render", None)  # pruning has rendered these
-    metrics = measure(fit)
-    assert len(cameras) == len(tiny.test)
-    assert metrics["seen"] is not None
-    measured = fit.annotated(metrics=metrics)
-    assert measured.test_renders[0] is fit.test_renders[0]
-    assert torch.equal(measured.test_renders[0].image, fit.render(tiny.test.camera(0)))

@@ -122,10 +122,6 @@ def test_select_takes_rows_and_bands():
         ({}, ""),
         ({"sh_degree": {"chosen": 3, "by": "photos", "gain": 0.4, "n": 2000}}, ""),
         (
-            {"sh_degree": {"chosen": 0, "by": "rule", "why": "too few views"}},
-            "each colour is the same from all directions: too few views",
-        ),
-        (
             {
                 "sh_degree": {"chosen": 0, "by": "photos", "gain": 0.02, "n": 2000},
                 "gaussians": {"fitted": 200, "kept": 114, "weight": 1.0, "sh_degree": 0},

@@ -192,22 +192,12 @@ def test_a_mistake_in_kgs_or_of_the_caller_is_no_fault_of_the_checkpoint(scene, 
     with refused(ArgumentError, name="device"):
         Trainer.resume(scene, replace(CONFIG, device="meta"), saved)
 
-    def failing(error):
-        def fail(*_, **__):
-            raise error
+    def fail(*_, **__):
+        raise torch.OutOfMemoryError
 
-        return fail
-
-    for function, error in (
-        ("kgs.fit.trainer.Plan.of", TypeError("unsupported operand")),
-        ("kgs.fit.state.TrainState._assemble", TypeError("unsupported operand")),
-        ("kgs.fit.trainer.targets", TypeError("unsupported operand")),
-        ("kgs.fit.state.GaussianModel", torch.OutOfMemoryError("out of memory")),
-    ):
-        with monkeypatch.context() as patch:
-            patch.setattr(function, failing(error))
-            with pytest.raises(type(error), match=str(error)):
-                Trainer.resume(scene, CONFIG, saved)
+    monkeypatch.setattr("kgs.fit.state.GaussianModel", fail)
+    with pytest.raises(torch.OutOfMemoryError):
+        Trainer.resume(scene, CONFIG, saved)
 
 
 # -- what may change -----------------------------------------------------------------------------------------------

@@ -21,10 +21,10 @@ def read_within_bounds(read: Callable[[Path], object], path: Path) -> str:
     """
     files = path.rglob("*") if path.is_dir() else [path]
     allowed = _MEMORY_FACTOR * sum(file.stat().st_size for file in files if file.is_file()) + _MEMORY
-    before = _reset_peak()
+    before = reset_peak()
     outcome, seconds = _timed(read, path)
     if before is not None:
-        assert _status("VmHWM") - before < allowed
+        assert peak() - before < allowed
     if seconds >= _SLOWEST:
         seconds = _timed(read, path)[1]
     assert seconds < _SLOWEST
@@ -42,13 +42,18 @@ def _timed(read: Callable[[Path], object], path: Path) -> tuple[str, float]:
     return outcome, time.perf_counter() - start
 
 
-def _reset_peak() -> int | None:
+def reset_peak() -> int | None:
     """Let the peak of the resident memory start again; the memory now, or None where the system cannot do that."""
     try:
         Path("/proc/self/clear_refs").write_text("5")
     except OSError:
         return None
     return _status("VmRSS")
+
+
+def peak() -> int:
+    """The largest memory since the last call of `reset_peak`."""
+    return _status("VmHWM")
 
 
 def _status(name: str) -> int:

@@ -130,10 +130,16 @@ def test_a_cut_begins_at_its_corner():
     assert image_size(cut) == (20, 30)
 
 
-@pytest.mark.parametrize("index", [1, -1, [2, 0], (0,), slice(1, None), torch.tensor([2, 0]), []])
+@pytest.mark.parametrize(
+    "index",
+    [
+        *(1, -1, np.int64(1), np.uint8(1), torch.tensor(1), [np.int32(1)], (0,), slice(1, None)),
+        *([2, 0], np.array([2, 0]), torch.tensor([2, 0]), []),
+    ],
+)
 def test_selected_cameras_are_those_of_the_tensors(index):
     cameras = batch(pinhole(3, 4, 5.0), pinhole(6, 7, 8.0), pinhole(9, 10, 11.0))
-    rows = torch.arange(3)[torch.tensor(index, dtype=torch.int64) if isinstance(index, list) else index].reshape(-1)
+    rows = torch.arange(3)[index if isinstance(index, slice) else torch.as_tensor(index, dtype=torch.int64)].reshape(-1)
     found = select(cameras, index)
     assert [int(side) for side in found.height] == [3 * int(row) + 3 for row in rows]
     assert torch.equal(found.intrinsics, cameras.intrinsics[rows])
@@ -142,7 +148,8 @@ def test_selected_cameras_are_those_of_the_tensors(index):
 
 @pytest.mark.parametrize(
     ("index", "error"),
-    [(3, IndexError), ([0, -4], IndexError), (1.0, TypeError), ([True, False], TypeError), ("one", TypeError)],
+    [(other, TypeError) for other in (1.0, np.float32(1), [0.5], True, [True, False], torch.tensor([True]), "one")]
+    + [(outside, IndexError) for outside in (3, -4, [0, -4])],
 )
 def test_cameras_that_do_not_exist_cannot_be_selected(index, error):
     with pytest.raises(error):

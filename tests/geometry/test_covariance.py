@@ -27,7 +27,7 @@ def dense(factors, eps2d=EPS2D):
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 7e-7), (torch.float64, 1e-14)])
-def test_rotations_are_scipys_and_orthonormal(dtype, tolerance):
+def test_convention_rotations_are_scipys_and_orthonormal(dtype, tolerance):
     quats = normal(100, 4)
     expected = torch.from_numpy(Rotation.from_quat(quats.roll(-1, 1).numpy()).as_matrix())
     got = rotation_matrices((quats * normal(100, 1, seed=1).exp()).to(dtype)).double()

@@ -24,7 +24,7 @@ def coefficients(m, bands, seed=1, dtype=torch.float64):
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-14), (torch.float32, 1e-6)])
-def test_basis_is_mpmaths(dtype, tolerance):
+def test_convention_basis_is_mpmaths(dtype, tolerance):
     vectors = directions(dtype=dtype)
     expected = []
     for x, y, z in vectors.double().tolist():
@@ -34,7 +34,7 @@ def test_basis_is_mpmaths(dtype, tolerance):
     torch.testing.assert_close(got, torch.tensor(expected, dtype=torch.float64), rtol=0, atol=tolerance)
 
 
-def test_the_signs_are_those_of_the_ply_files():
+def test_convention_signs_are_those_of_ply_files():
     """The first band is -y, z, -x; written out by hand for the axes, with no formula at all."""
     c1 = math.sqrt(3 / (4 * math.pi))
     basis = harmonics_basis(AXES[[0, 2, 4]], 1)

@@ -6,20 +6,11 @@ import inspect
 import numpy as np
 import pytest
 import torch
-from kornia.image import ImageSize
-from kornia.sensors.camera import CameraModel, CameraModelType
 
 import kgs
 import kgs.reference
-from kgs import Gaussians, PosedCamera
+from kgs import Gaussians
 from kgs.geometry.harmonics import evaluate_harmonics
-
-PARAMS = {
-    CameraModelType.PINHOLE: 4,
-    CameraModelType.BROWN_CONRADY: 12,
-    CameraModelType.KANNALA_BRANDT_K3: 8,
-    CameraModelType.ORTHOGRAPHIC: 4,
-}
 
 
 def fields(n=5, bands=4, dtype=torch.float32):
@@ -30,10 +21,6 @@ def fields(n=5, bands=4, dtype=torch.float32):
         "opacities": torch.ones(n, dtype=dtype),
         "colors": torch.zeros(n, bands, 3, dtype=dtype),
     }
-
-
-def model(kind=CameraModelType.PINHOLE, batch=()):
-    return CameraModel(ImageSize(4, 6), kind, torch.ones(*batch, PARAMS[kind]))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -87,24 +74,6 @@ def test_wrong_shapes_types_dtypes_and_devices_name_the_argument(name):
     for error, value in wrong:
         with pytest.raises(error, match=f"^{name}:"):
             Gaussians(**given | {name: value})
-
-
-@pytest.mark.parametrize("kind", list(PARAMS))
-@pytest.mark.parametrize("batch", [(), (1,), (3,)])
-def test_posed_camera_takes_every_model_with_shared_or_own_parameters(kind, batch):
-    PosedCamera(model(kind, batch), torch.eye(4).expand(3, 4, 4))
-
-
-def test_equality_is_identity_and_does_not_raise():
-    first, second = Gaussians(**fields()), Gaussians(**fields())
-    assert first == first
-    assert first != second
-    assert len({first, second}) == 2
-    assert first in [first]
-    assert second not in [first]
-    camera = PosedCamera(model(), torch.eye(4)[None])
-    assert camera == camera
-    assert camera != PosedCamera(model(), torch.eye(4)[None])
 
 
 @pytest.mark.parametrize("rows", [None, 2])

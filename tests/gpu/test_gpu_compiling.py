@@ -124,20 +124,6 @@ def test_one_that_cannot_be_compiled_is_left_out():
     assert [kernel.loaded for kernel in kernels] == [0, 1]
 
 
-def test_the_log_says_how_far_it_is(monkeypatch, caplog):
-    monkeypatch.setattr(compiling, "_INTERVAL", 0.02)
-    monkeypatch.setattr(compiling, "cores", lambda: 2)
-    said = threading.Event()
-    monkeypatch.setattr(compiling._log, "filters", [lambda _: said.set() or True])
-    with caplog.at_level(logging.INFO, "kgs"):
-        compile_together([called(Kernel(lambda: said.wait(30))), called(Kernel())], CPU)
-    assert caplog.messages[-1] == "compiling kernels for this card, once: 1 of 2"
-    caplog.clear()
-    with caplog.at_level(logging.INFO, "kgs"):
-        compile_together([called(Kernel())], CPU)
-    assert not caplog.messages
-
-
 def test_what_goes_wrong_meanwhile_is_no_error(monkeypatch, caplog):
     monkeypatch.delenv("TRITON_INTERPRET")
     devices = []

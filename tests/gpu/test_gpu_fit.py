@@ -159,9 +159,3 @@ def test_without_triton_a_clear_error(monkeypatch):
     monkeypatch.setattr("kgs.backends.table._is_found", lambda package: False)
     with pytest.raises(ModuleNotFoundError, match='"triton" needs triton, torch brings it on Linux'):
         kgs.GaussianRenderer(backend="triton")
-
-
-def test_on_a_cpu_without_the_interpreter_it_is_refused(monkeypatch):
-    monkeypatch.delenv("TRITON_INTERPRET")
-    with pytest.raises(ValueError, match='expected "auto" or "torch" on cpu, got "triton", which runs on cuda and xpu'):
-        get_backend("triton", CPU)

@@ -149,30 +149,6 @@ def test_a_second_call_runs_what_was_compiled_with_pointers():
     assert len(fake.compiled[0].runs) == 2
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda x: ((x[1:], x, 5, 0, 0.5), {"BLOCK": 8}),
-        lambda x: ((x.long(), x, 5, 0, 0.5), {"BLOCK": 8}),
-        lambda x: ((x, x, 1, 0, 0.5), {"BLOCK": 8}),
-        lambda x: ((x, x, 16, 0, 0.5), {"BLOCK": 8}),
-        lambda x: ((x, x, 2**31, 0, 0.5), {"BLOCK": 8}),
-        lambda x: ((x, x, 5, 2**31, 0.5), {"BLOCK": 8}),
-        lambda x: ((x, x, 5, 0, 0.5), {"BLOCK": 16}),
-        lambda x: ((x, x, 5, 0, 0.5), {"BLOCK": 8, "warps": 1}),
-    ],
-)
-def test_what_triton_compiles_for_is_compiled_anew(change):
-    fake = Kernel()
-    x = torch.zeros(8)
-    launch(fake, (1,), x, x, 5, 0, 0.5, BLOCK=8)
-    arguments, options = change(x)
-    for _ in range(2):
-        launch(fake, (1,), *arguments, **options)
-    assert len(fake.calls) == 2
-    assert [len(compiled.runs) for compiled in fake.compiled] == [0, 1]
-
-
 def test_another_card_is_compiled_for_anew(monkeypatch):
     fake = Kernel()
     x = torch.zeros(8)

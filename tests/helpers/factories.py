@@ -108,6 +108,17 @@ def posed(
     return PosedCamera(CameraModel(ImageSize(*size), kind, params), extrinsics)
 
 
+def looking_at(target: Tensor, centers: Tensor, up: Tensor) -> Tensor:
+    """World-to-camera matrices `(V, 4, 4)`, float64, of upright cameras with these centres."""
+    centers = centers.double()
+    ahead = torch.nn.functional.normalize(target.double() - centers, dim=1)
+    right = torch.nn.functional.normalize(torch.linalg.cross(ahead, up.double().expand_as(ahead)), dim=1)
+    poses = torch.eye(4).double().repeat(len(centers), 1, 1)
+    poses[:, :3, :3] = torch.stack([right, torch.linalg.cross(ahead, right), ahead], 1)
+    poses[:, :3, 3] = -(poses[:, :3, :3] @ centers[:, :, None])[:, :, 0]
+    return poses
+
+
 # -- Gaussians -----------------------------------------------------------------------------------------------------
 
 

@@ -11,8 +11,23 @@ import numpy as np
 from init_point_scenes import CENTERS, cameras, painted_planes
 from kornia.geometry.camera import PinholeCamera
 
+from kgs.app.sfm import read
+from kgs.app.sfm.find import find_photos, notes_on
+from kgs.datasets.masks import find_masks
+
 NAMES = ("IMG_1.png", "IMG_2.png", "IMG_3.png")
 SMALL = (160, 120)
+
+
+def open_photos(paths: Sequence[Path], masks: Path | None = None) -> list[read.OpenPhoto]:
+    """Photos of one folder with their masks, as a command opens them."""
+    return read.open_photos(paths, find_masks(paths, paths[0].parent, masks))
+
+
+def notes_of(folder: Path, masks: Path | None = None) -> list[str]:
+    """What a command says of a folder of photos before it reads them."""
+    photos = find_photos(folder)
+    return notes_on(folder, photos, find_masks(photos, folder, masks))
 
 
 def planes(posed: PinholeCamera | None = None) -> np.ndarray:

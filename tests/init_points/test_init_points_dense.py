@@ -11,7 +11,6 @@ from yard import yard_depths, yard_from_above, yard_scene
 
 from kgs import ArgumentError
 from kgs.datasets.scene import Views
-from kgs.datasets.synthetic import synthetic_depths, synthetic_scene
 from kgs.geometry.cameras import project, to
 from kgs.geometry.multiview import nearest_pixels
 from kgs.geometry.rigs import camera_centers
@@ -95,15 +94,6 @@ def test_planes_out_of_range(views):
     for near, far in ((0.0, 1.0), (2.0, 1.0), (1.0, math.inf), (math.nan, 1.0)):
         with refused(ArgumentError, name="near, far"):
             sweep_depths(views, near, far)
-
-
-@pytest.mark.parametrize("count", [2, pytest.param(10, marks=pytest.mark.slow)])
-def test_two_views_and_many(count):
-    scene = synthetic_scene(train_views=count, test_views=1, size=(42, 56), seed=0)
-    depths = synthetic_depths(scene.train.cameras, seed=0)
-    points, *_ = dense_points(scene.train, 0.8 * float(depths.min()), 1.25 * float(depths.max()), 5000, generator())
-    assert len(points) > 300
-    assert points.isfinite().all()
 
 
 @pytest.mark.parametrize(("shown", "count"), [("one view", 200), ("grey", 200), ("mirrors", 2000)])
@@ -200,14 +190,6 @@ def test_as_many_planes_are_wanted_as_a_picture_moves_by_pixels():
     views = Views(PinholeCamera(intrinsics, extrinsics, side, side), torch.rand(2, 3, 64, 64), ("a", "b"))
     assert planes_wanted(views, 2.0, 10.0) * 127 / 128 == pytest.approx(500 * 0.3 * (1 / 2 - 1 / 10), rel=1e-6)
     assert planes_wanted(views.select([0]), 2.0, 10.0) == 0.0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("draw", ["uniform", "spread"])
-def test_few_points_are_enough_where_many_agree(draw):
-    result = initial_points(synthetic_scene(train_views=3, size=(72, 96)).train, "dense", count=500, draw=draw)
-    assert result.kind == "dense"
-    assert 450 <= len(result.points) <= 500
 
 
 @pytest.mark.slow

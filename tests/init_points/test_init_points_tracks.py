@@ -53,7 +53,7 @@ def test_a_pattern_repeated_along_the_epipolar_lines_is_not_matched():
     assert counts[1] < 0.05 * counts[0]
 
 
-def test_triangulation_agrees_with_opencv_for_two_views():
+def test_convention_triangulation_is_opencvs():
     posed, rng = cameras(), np.random.default_rng(0)
     pixels = rng.uniform(50, 200, (40, 3, 2))
     pixels[:, 2] = pixels[:, 0] + rng.uniform(-30, -10, (40, 1)) * [1, 0]

@@ -1,17 +1,13 @@
 """The compiled matching of keypoints against torch's: the same pairs, ties included, on any number of threads."""
 
-import re
-
 import pytest
 import torch
-from kernel_checks import avx_assembly, check_bits
+from kernel_checks import check_bits
 
 from kgs.backends import BACKENDS
 from kgs.init_points import matching
 
-nb = pytest.importorskip("numba")
-
-from kgs.init_points import matching_kernels as kernels  # noqa: E402  # needs numba
+pytest.importorskip("numba")
 
 
 def keypoints(n, m, seed=0):
@@ -54,12 +50,3 @@ def test_the_first_of_equal_pairs_has_the_other_as_its_rival(monkeypatch):
 
 def test_bits_do_not_depend_on_threads():
     check_bits(lambda: matches(keypoints(333, 444), "numba"), (1, 2, 3))
-
-
-@pytest.mark.slow
-def test_inner_loops_are_vector_code():
-    rows, numbers, floats = nb.float32[:, ::1], nb.int64[:, ::1], nb.float32[::1]
-    arguments = (rows, rows, rows, rows, nb.float32, floats, floats, nb.int64[::1], rows, rows, numbers)
-    assembly = avx_assembly(kernels.find_nearest, nb.int64, nb.int64, *arguments)
-    for operation in ("sub", "add|mul|fm", "and"):  # of descriptors; of lines; the absolute value
-        assert re.search(rf"\bv\w*(?:{operation})\w*\b.*[yz]mm", assembly)

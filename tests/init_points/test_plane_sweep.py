@@ -1,11 +1,8 @@
 """The plane sweep: scores by their definition, compiled against torch's, the same bits on any number of threads."""
 
-import re
-
 import pytest
 import torch
-from factories import other_defaults
-from kernel_checks import avx_assembly, check_bits
+from kernel_checks import check_bits
 from torch.nn.functional import grid_sample, pad
 
 from kgs.backends import BACKENDS
@@ -14,13 +11,7 @@ from kgs.init_points import plane_sweep
 from kgs.init_points import sweep_costs as sweep_costs_module
 from kgs.init_points.sweep_costs import sweep_costs
 
-nb = pytest.importorskip("numba")
-
-from kgs.init_points import sweep_kernels as kernels  # noqa: E402  # needs numba
-
-VOLUME, IMAGE = nb.float32[:, :, ::1], nb.float32[:, ::1]
-PRICES = nb.types.UniTuple(nb.float32, 4)
-CONSTANTS = nb.types.UniTuple(nb.float32, 3)
+pytest.importorskip("numba")
 
 
 def pictures(count, height, width, planes, seed=0):
@@ -100,16 +91,6 @@ def test_a_warped_ramp_is_a_ramp_and_empty_behind_the_camera(last_row):
     torch.testing.assert_close(warped, (0.2 + 0.01 * u + 0.02 * v).where(expected, 0).float(), rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("count", [2, pytest.param(5, marks=pytest.mark.slow)])
-def test_depth_maps_are_torchs(count):
-    views = synthetic_scene(train_views=count, test_views=1, size=(48, 64), seed=0).train
-    maps = [plane_sweep.sweep_depths(views, 2.0, 20.0, backend=backend) for backend in ("numba", "torch")]
-    for results, expected in zip(*maps, strict=True):
-        same = (results.depths / expected.depths - 1).abs() < 1e-4
-        assert float(same.double().mean()) > 0.999
-        assert float((results.scores - expected.scores)[same].abs().max()) < 1e-5
-
-
 def boxes(images):
     """What `_box` does on a GPU."""
     return sweep_costs_module._pooled(images.reshape(-1, *images.shape[-2:])).reshape(images.shape)
@@ -121,19 +102,7 @@ def test_windows_on_a_gpu_have_the_means_of_opencv(size):
     torch.testing.assert_close(boxes(images), sweep_costs_module._box(images), rtol=1e-12, atol=1e-14)
 
 
-def test_depth_maps_as_a_gpu_makes_them_are_those_of_the_kernels(monkeypatch):
-    views = synthetic_scene(train_views=2, test_views=1, size=(48, 64), seed=0).train
-    expected = plane_sweep.sweep_depths(views, 2.0, 20.0, backend="numba")
-    monkeypatch.setattr(sweep_costs_module, "_box", boxes)
-    results = plane_sweep.sweep_depths(views, 2.0, 20.0, backend="torch")
-    for one, other in zip(results, expected, strict=True):
-        same = (one.depths / other.depths - 1).abs() < 1e-4
-        assert float(same.double().mean()) > 0.999
-        assert float((one.scores - other.scores)[same].abs().max()) < 1e-5
-
-
-@pytest.mark.parametrize("backend", ["auto", "torch", "triton"])
-def test_a_sweep_stays_on_its_device_and_its_maps_are_on_the_cpu(monkeypatch, backend):
+def test_a_sweep_stays_on_its_device_and_its_maps_are_on_the_cpu(monkeypatch):
     """The meta device stands for a GPU: an operator that gets tensors of both raises an error."""
     fetched = []
 
@@ -141,10 +110,10 @@ def test_a_sweep_stays_on_its_device_and_its_maps_are_on_the_cpu(monkeypatch, ba
         fetched.append(tensor.device.type)
         return torch.zeros_like(tensor, device="cpu")
 
-    views = synthetic_scene(train_views=3, test_views=1, size=(24, 32), seed=0).train
+    views = synthetic_scene(train_views=2, test_views=1, size=(24, 32), seed=0).train
     to_cpu = torch.Tensor.cpu
     monkeypatch.setattr(torch.Tensor, "cpu", lambda x: cpu(x) if x.is_meta else to_cpu(x))
-    maps = plane_sweep.sweep_depths(views, 2.0, 20.0, backend=backend, device=torch.device("meta"))
+    maps = plane_sweep.sweep_depths(views, 2.0, 20.0, backend="auto", device=torch.device("meta"))
     assert len(maps) == len(views)
     for depth_map in maps:
         for values in vars(depth_map).values():
@@ -152,34 +121,6 @@ def test_a_sweep_stays_on_its_device_and_its_maps_are_on_the_cpu(monkeypatch, ba
     assert fetched == ["meta"] * 3 * len(views)
 
 
-def test_a_sweep_is_the_same_under_another_default_device_and_dtype():
-    views = synthetic_scene(train_views=2, test_views=1, size=(24, 32), seed=0).train
-    for backend in ("numba", "torch"):
-        expected = plane_sweep.sweep_depths(views, 2.0, 20.0, backend=backend)
-        with other_defaults():
-            results = plane_sweep.sweep_depths(views, 2.0, 20.0, backend=backend)
-        for one, other in zip(results, expected, strict=True):
-            assert all(torch.equal(value, vars(other)[name]) for name, value in vars(one).items())
-
-
 def test_bits_depend_neither_on_threads_nor_on_repetition():
     arguments = pictures(2, 70, 61, 24)
     check_bits(lambda: sweep_costs(*arguments, BACKENDS["numba"]), (1, 1, 2, 2, 3, 3, 4, 4))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "arguments", "pattern", "operations"),  # of the loops over columns or planes, in the source
-    [
-        (
-            "compare_tiles",
-            (IMAGE, nb.float64[:, ::1], IMAGE, CONSTANTS, VOLUME, nb.float64[:, :, :, ::1], VOLUME),
-            "add|sub",
-            32,
-        ),
-        ("add_paths", (VOLUME, IMAGE, nb.int64, nb.int64, PRICES, VOLUME), "add|sub|min|cmp", 9),
-    ],
-)
-def test_inner_loops_are_vector_code(name, arguments, pattern, operations):
-    assembly = avx_assembly(getattr(kernels, name), nb.int64, nb.int64, *arguments)
-    assert len(re.findall(rf"\bv\w*(?:{pattern})\w*p[sd]\b.*[yz]mm", assembly)) >= operations

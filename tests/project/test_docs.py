@@ -178,12 +178,6 @@ def test_its_lists_begin_below_an_empty_line(path):
     assert not re.findall(r"^(?![-*] |\d+\. |[ #|]).+\n(?:[-*]|\d+\.) .*$", text, re.M)
 
 
-def test_links_are_found():
-    text = "![a](b.png) [c\nd](e.md#f) `[g](h)` [i](https://j.k) <img alt='' src=\"l.png\">\n\n```\n[m](n)\n```\n"
-    assert links(text) == ["b.png", "e.md#f", "l.png"]
-    assert "against-given-poses" in anchors(ROOT / "docs" / "results" / "cameras" / "photos.md")
-
-
 @pytest.mark.skipif(shutil.which("sed") is None, reason="no sed")
 def test_the_readme_of_a_published_package_links_to_the_repository(tmp_path):
     """By the commands in CONTRIBUTING.md."""

@@ -145,6 +145,12 @@ kgs.GaussianRenderer
 print(*sorted(set(sys.modules) - before))
 sys.modules["resource"] = None
 import kgs.fit.run, kgs._support.machine, kgs.datasets.load
+from kgs.fit.adam import Adam
+x = torch.ones(3, requires_grad=True)
+adam = Adam([{"params": [x], "name": "x", "lr": 0.1}])
+x.sum().backward()
+adam.step()
+adam.zero_grad()
 print("slow:", *{"scipy.spatial", "networkx", "trimesh", "matplotlib", "torch._dynamo"} & set(sys.modules))
 from pathlib import Path
 exists = Path.exists

@@ -80,16 +80,6 @@ def test_rigid_motion_of_world_and_camera(seed, dtype, bound):
 
 
 @pytest.mark.parametrize(("dtype", "bound"), DTYPES)
-def test_translation_keeps_the_view_dependent_colour(dtype, bound):
-    gaussians, camera = scene(0, dtype, sh_degree=3)
-    shift = torch.tensor([0.5, -1.0, 2.0], dtype=dtype)
-    moved = dataclasses.replace(gaussians, means=gaussians.means + shift)
-    pose = camera.extrinsics.clone()
-    pose[0, :3, 3] -= pose[0, :3, :3] @ shift
-    assert difference(EXACT, (gaussians, camera), (moved, with_camera(camera, pose))) <= bound
-
-
-@pytest.mark.parametrize(("dtype", "bound"), DTYPES)
 @pytest.mark.parametrize("scale", [1e-6, 1e-3, 0.3, 1e3, 1e6])
 def test_scale_of_the_world(scale, dtype, bound):
     gaussians, camera = scene(1, dtype, sh_degree=3)
@@ -106,71 +96,3 @@ def test_scale_of_the_world(scale, dtype, bound):
     # and with the default near plane a small world is behind it
     if scale <= 1e-3:
         assert len(GaussianRenderer()(larger, with_camera(camera, pose)).projected) == 0
-
-
-@pytest.mark.parametrize(("dtype", "bound"), DTYPES)
-@pytest.mark.parametrize("axis", [0, 1])
-def test_mirror(axis, dtype, bound):
-    gaussians, camera = scene(0, dtype, sh_degree=0)
-    flip = torch.ones(3, dtype=dtype)
-    flip[axis] = -1
-    # a rotation seen in a mirror turns the other way about the axes that lie in the mirror
-    mirrored = dataclasses.replace(
-        gaussians, means=gaussians.means * flip, quats=gaussians.quats * torch.cat([flip[:1].abs(), -flip])
-    )
-    intrinsics, pose = camera.intrinsics.clone(), camera.extrinsics.clone()
-    size = (camera.width, camera.height)[axis]
-    intrinsics[:, axis, 2] = size - 1 - intrinsics[:, axis, 2]
-    full = torch.diag(torch.cat([flip, flip.new_ones(1)]))
-    seen = PinholeCamera(intrinsics, full @ pose @ full, camera.height, camera.width)
-    a, b = EXACT(gaussians, camera).image, EXACT(mirrored, seen).image
-    assert (a - b.flip(3 - axis)).abs().max() <= bound
-
-
-@pytest.mark.parametrize(("dtype", "bound"), DTYPES)
-def test_a_quaternion_and_its_negative_and_its_multiples(dtype, bound):
-    gaussians, camera = scene(0, dtype)
-    expected = GaussianRenderer()(gaussians, camera, outputs=OUTPUTS)
-    negative = dataclasses.replace(gaussians, quats=-gaussians.quats)
-    assert_same(GaussianRenderer()(negative, camera, outputs=OUTPUTS), expected)
-    for factor in (1e-20, 0.25, 1e20):
-        longer = dataclasses.replace(gaussians, quats=gaussians.quats * factor)
-        assert difference(EXACT, (longer, camera), (gaussians, camera)) <= bound
-
-
-@pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 2e-6), (torch.float64, 1e-12)])
-@pytest.mark.parametrize("window", [(0, 0, 40, 56), (3, 5, 20, 31), (11, 0, 29, 8), (20, 25, 2, 9)])
-def test_crop_is_the_window_of_the_whole(window, dtype, bound):
-    top, left, height, width = window
-    gaussians, camera = scene(1, dtype)
-    # within the tangent limits of the window, which reach 15 % beyond it: otherwise footprints differ by definition
-    x, y = EXACT(gaussians, camera).projected.means2d.unbind(1)
-    inside = (x > left - 0.5 - 0.15 * width) & (x < left + width - 0.5 + 0.15 * width)
-    inside &= (y > top - 0.5 - 0.15 * height) & (y < top + height - 0.5 + 0.15 * height)
-    gaussians = select(gaussians, inside)
-    assert len(gaussians) > 0
-    intrinsics = camera.intrinsics.clone()
-    intrinsics[:, 0, 2] -= left
-    intrinsics[:, 1, 2] -= top
-    crop = PinholeCamera(intrinsics, camera.extrinsics, torch.tensor([height]), torch.tensor([width]))
-    a = EXACT(gaussians, camera, outputs=("image", "alpha"))
-    b = EXACT(gaussians, crop, outputs=("image", "alpha"))
-    for name in ("image", "alpha"):
-        part = getattr(a, name)[:, :, top : top + height, left : left + width]
-        assert (part - getattr(b, name)).abs().max() <= bound
-
-
-@pytest.mark.parametrize(("dtype", "bound"), DTYPES)
-@pytest.mark.parametrize("k", [3, 5])
-def test_k_times_the_pixels_coincide_at_the_coarse_centres(k, dtype, bound):
-    gaussians, camera = scene(0, dtype, n=60, size=(16, 20))
-    intrinsics = camera.intrinsics.clone()
-    intrinsics[:, :2, :2] *= k
-    intrinsics[:, :2, 2] = k * intrinsics[:, :2, 2] + (k - 1) / 2
-    fine = PinholeCamera(intrinsics, camera.extrinsics, camera.height * k, camera.width * k)
-    exact = {"alpha_threshold": 0, "transmittance_stop": 0}
-    a = GaussianRenderer(**exact)(gaussians, camera, outputs=("image", "depth"))
-    b = GaussianRenderer(eps2d=0.3 * k * k, **exact)(gaussians, fine, outputs=("image", "depth"))
-    first = (k - 1) // 2
-    assert b.image.shape == (1, 3, 16 * k, 20 * k)
-    assert (a.image - b.image[:, :, first::k, first::k]).abs().max() <= bound

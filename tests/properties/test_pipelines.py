@@ -7,11 +7,10 @@ import torch
 from factories import drop_layer as at
 from factories import pinhole, random_camera, random_gaussians, random_model
 from factories import random_opacities as draw
-from torch import nn
 from torch.utils.checkpoint import checkpoint
 
 from kgs import DropGaussian, GaussianRenderer, Gaussians
-from kgs.losses import photometric_loss, target_moments
+from kgs.losses import photometric_loss
 
 
 def test_activation_checkpointing_recomputes_the_same_mask():
@@ -81,57 +80,6 @@ def test_a_rate_that_rises_is_not_compiled_anew(seed, schedule):
     (counts, outputs), (_, expected) = run(True), run(False)
     assert counts == [2] * 12, "what is before the layer, and what is behind it"
     assert all(torch.equal(a, b) for a, b in zip(outputs, expected, strict=True))
-
-
-class Blobs(nn.Module):
-    """Somebody else's splatting: round blobs in the plane, front to back, in plain torch; one line is ours."""
-
-    def __init__(self, drop, count=40, size=24, seed=0):
-        super().__init__()
-        generator = torch.Generator().manual_seed(seed)
-        self.means2d = nn.Parameter(size * torch.rand(count, 2, generator=generator))
-        self.colors = nn.Parameter(torch.rand(count, 3, generator=generator))
-        self.logits = nn.Parameter(torch.zeros(count))
-        self.drop, self.size = drop, size
-
-    def forward(self, offset=0.0):
-        opacities = self.drop(self.logits.sigmoid())
-        y, x = torch.meshgrid(torch.arange(self.size), torch.arange(self.size), indexing="ij")
-        pixels = torch.stack([x, y], dim=-1).reshape(-1, 1, 2)
-        alphas = opacities * torch.exp(-(pixels - self.means2d - offset).square().sum(-1) / 18)
-        alphas = alphas.clamp(max=0.99)
-        light = torch.cumprod(torch.cat([torch.ones_like(alphas[:, :1]), 1 - alphas], dim=1), dim=1)[:, :-1]
-        return ((light * alphas) @ self.colors).T.reshape(1, 3, self.size, self.size)
-
-
-def photo():
-    return Blobs(nn.Identity(), seed=5)().detach()
-
-
-def fit(network, steps=30):
-    """A plain training loop; returns the losses."""
-    target = photo()
-    adam = torch.optim.Adam(network.parameters(), lr=0.05)
-    losses = []
-    for i in range(steps):
-        network.drop.progress = (i + 1) / steps
-        loss = photometric_loss(network(), target, moments=target_moments(target))
-        adam.zero_grad()
-        loss.backward()
-        adam.step()
-        losses.append(loss.item())
-    return losses
-
-
-@pytest.mark.parametrize("seed", [None, 3])
-def test_a_foreign_trainer_needs_one_line(seed):
-    network = Blobs(DropGaussian(p=0.2, seed=seed))
-    before = photometric_loss(network.eval()(), photo()).item()
-    losses = fit(network.train())
-    assert losses != fit(Blobs(nn.Identity()))
-    assert photometric_loss(network.eval()(), photo()).item() < 0.6 * before
-    with torch.inference_mode():
-        assert torch.equal(network(), network())
 
 
 # -- other contexts ------------------------------------------------------------------------------------------------

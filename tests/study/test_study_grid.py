@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import ExitStack
 from pathlib import Path
 from unittest import mock
 
@@ -46,14 +45,6 @@ def where(request):
     if request.param != "dask":
         return {"processes": 1 if request.param == "one" else 2}
     return {"scheduler": request.getfixturevalue("cluster").scheduler_address}
-
-
-@pytest.mark.slow
-def test_rows_come_in_the_order_of_the_cells(tmp_path, threads):
-    cells = [{"x": x, "log": str(tmp_path), "seconds": 0.6 * (x == 0), "kill": None} for x in range(4)]
-    rows = run_grid(cells, do, tmp_path / "g.jsonl", scheduler=threads, say=quiet)
-    assert [row["result"]["y"] for row in rows] == [0, 1, 4, 9]
-    assert [row["cell"]["x"] for row in read_rows(tmp_path / "g.jsonl")][-1] == 0
 
 
 def test_finished_cells_are_not_repeated(tmp_path, threads):
@@ -118,53 +109,6 @@ def test_a_process_that_dies_takes_no_other_cell_with_it(tmp_path, where):
     assert times_done(tmp_path) == dict.fromkeys(others, 1)
     assert (tmp_path / "killed 2").exists()
     assert "scheduler" in where or not processes_left(tmp_path)
-
-
-@pytest.fixture
-def machines(tmp_path, monkeypatch):
-    """The commands for several machines: a scheduler, and two workers that nothing starts again; its address."""
-    pytest.importorskip("distributed")
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
-    address_file = tmp_path / "scheduler.json"
-    with ExitStack() as stack:
-
-        def start(*words):
-            command = [sys.executable, "-m", "dask", *words, "--no-dashboard"]
-            process = stack.enter_context(subprocess.Popen(command, stderr=subprocess.DEVNULL))
-            stack.callback(process.kill)
-
-        start("scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(address_file))
-        for _ in range(2):
-            start("worker", "--scheduler-file", str(address_file), "--nthreads", "1", "--no-nanny")
-        until = time.monotonic() + 30
-        while not (address_file.exists() and address_file.read_text()):
-            assert time.monotonic() < until
-            time.sleep(0.05)
-        yield json.loads(address_file.read_text())["address"]
-
-
-@pytest.mark.slow
-def test_a_machine_that_is_lost_loses_no_cell(tmp_path, machines):
-    """Its worker is killed while it does a cell: the other one does it again, and each is a line of the file once."""
-    path, cells = tmp_path / "g.jsonl", cells_in(tmp_path, 8)
-    for cell in cells[1::2]:
-        cell["seconds"] = 0.5  # goes on when its neighbour is done
-    cut_off = []
-
-    def kill(line):
-        """Once a cell is done, kill the worker that is doing another."""
-        done = times_done(tmp_path) if (tmp_path / "done").exists() else {}
-        for process in tmp_path.glob("process *"):
-            x = int(process.read_text())
-            if done and x not in done and not cut_off:
-                os.kill(int(process.name.split()[1]), signal.SIGKILL)
-                cut_off.append(x)
-
-    rows = run_grid(cells, do, path, scheduler=machines, say=kill)
-    assert cut_off
-    assert [row["cell"]["x"] for row in rows] == list(range(8))
-    assert sorted(row["cell"]["x"] for row in read_rows(path)) == list(range(8))
-    assert times_done(tmp_path) == dict.fromkeys(range(8), 1)
 
 
 @pytest.mark.slow

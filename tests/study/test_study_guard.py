@@ -82,25 +82,9 @@ def keep(stored, wanted):
     stored.write_text("\n".join(lines) + "\n")
 
 
-# -- the cells ----------------------------------------------------------------------------------------------------
-
-
-def test_one_seed_of_three_methods_comes_first_and_what_tells_the_noise_last(cells):
-    first = [(*scene, method, 0) for scene in GUARD.items() for method in (AUTO, AUTO_OFF, PAPER)]
-    last = [(*scene, AUTO, seed) for seed in (1, 2) for scene in GUARD.items()]
-    found = [tuple(cell[key] for key in ("scene", "views", "method", "seed")) for cell in cells]
-    assert found == first + last
-    assert {(cell["start"], cell["downscale"]) for cell in cells} == {("dense", 2.0)}
-    steps = {(cell["method"], cell["fit"]["steps"]) for cell in cells}
-    assert steps == {(AUTO, None), (AUTO_OFF, None), (PAPER, 700)}  # None: the default's own
-
-
 def test_what_is_stored_are_the_cells_of_the_preset(cells):
     assert [row["cell"] for row in read_rows(STORED)] == cells
     assert STORED.stat().st_size < 100_000
-
-
-# -- the report ---------------------------------------------------------------------------------------------------
 
 
 def test_changes_are_those_to_the_cell_of_the_same_seed(rows_of, report, tmp_path):
@@ -157,14 +141,6 @@ def test_the_noise_is_told_by_seeds(seeds, stored_seeds, noises, rows_of, report
     assert ("nothing stored to tell a change from noise by" in text) == (not noises)
 
 
-def test_unchanged_fits_have_no_change_and_no_mark(rows_of, report, stored, tmp_path):
-    text = report(rows_of(methods=(AUTO, AUTO_OFF, PAPER), seeds=(0, 1, 2)))
-    assert "No mean has changed beyond noise." in text
-    assert table(text)[FERN]["change of PSNR [dB]"].startswith("+0.00 (")
-    assert " !" not in text.partition("\nauto:")[2]
-    assert (tmp_path / "new" / "guard.jsonl").read_bytes() == stored.read_bytes()
-
-
 def test_without_stored_cells_of_these_settings_there_are_values_alone(rows_of, report, tmp_path):
     other_steps = rows_of()
     for row in other_steps:
@@ -188,9 +164,6 @@ def test_without_weights_lpips_is_left_out(rows_of, report):
     line = table(report(rows_of(lpips=None)))[FERN]
     assert not [head for head in line if "LPIPS" in head]
     assert "change of PSNR [dB]" in line
-
-
-# -- the command --------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture

@@ -7,13 +7,13 @@ from .tools import check_installed, load_tools
 
 
 def speed(*, out: Out, quick: bool = False, device: str = "auto") -> None:
-    """Measure time and memory of renders and training steps with torch and numba.
+    """Measure time and memory of renders and training steps with torch and with kernels.
 
     For example:
       kgs bench speed -o speed
       kgs bench speed -o speed --quick --device cuda
 
-    Writes speed.csv, speed.json, speed.md and scaling.png in minutes, with --quick in tens of seconds.
+    Writes speed.csv, speed.md and scaling.png in minutes, with --quick in tens of seconds.
 
     Args:
         out: folder for the results, created if it does not exist.
@@ -37,7 +37,7 @@ def precision(*, out: Out, quick: bool = False) -> None:
       kgs bench precision -o precision
       kgs bench precision -o precision --quick
 
-    Writes precision.csv, .json and .md, render.png and gradients.png in 5 minutes, with --quick in half a minute.
+    Writes precision.csv, precision.md, render.png and gradients.png in 5 minutes, with --quick in half a minute.
 
     Args:
         out: folder for the results, created if it does not exist.
@@ -60,7 +60,7 @@ def extremes(*, out: Out) -> int:
       kgs bench extremes -o extremes
       OMP_NUM_THREADS=1 kgs bench extremes -o extremes-1
 
-    Writes extremes.csv, extremes.json and extremes.md in seconds. The exit code is 1 if a bound is exceeded.
+    Writes extremes.csv and extremes.md in seconds. The exit code is 1 if a bound is exceeded.
 
     Args:
         out: folder for the results, created if it does not exist.

@@ -10,8 +10,9 @@ from typing import Annotated, Any, Literal, get_type_hints
 import tyro
 
 from kgs._support.errors import ArgumentError
+from kgs.app.details import COARSE, DETAILS
 from kgs.app.files.results import Results
-from kgs.fit.config import COARSE, DETAILS, PRESETS, Background, FitConfig, min_side
+from kgs.fit.config import PRESETS, Background, FitConfig, min_side
 
 from .checks import check_frames, check_init, check_photos, check_roll
 from .options import QUIET, Flag, IfGiven, Open, Out

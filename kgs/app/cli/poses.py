@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from kgs._support.errors import DataError
-from kgs.app.console import as_line, say, say_next
+from kgs.app.console import as_line, say_next
 from kgs.app.files.results import Results
 
 from .checks import check_frames
@@ -47,7 +47,5 @@ def poses(
 
         from kgs.app.sfm.pose import pose
 
-        for note in source.notes(masks):
-            say(note)
         pose(source, results, seed=seed, masks=masks, frames=frames)
     say_next(as_line("kgs", "fit", out, "-o", Path(f"{out.resolve().name}-fit")))

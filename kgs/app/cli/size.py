@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from kgs._support.errors import ArgumentError, quoted
 from kgs.app.console import say
-from kgs.fit.config import DETAILS
+from kgs.app.details import DETAILS
 
 from .checks import check_side
 

@@ -43,8 +43,6 @@ def find_scene(
     from kgs.app.sfm import pose
 
     masks = Path(request.masks) if request.masks else None
-    for note in source.notes(masks):
-        say(note)
     with on_ctrl_c("the cameras were not found yet, and nothing was written"):
         report = pose.pose(source, results, seed=seed, masks=masks, frames=frames, for_fit=True)
     largest = max(report["size"])

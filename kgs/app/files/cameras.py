@@ -25,19 +25,21 @@ def camera_list(views: Sequence[Views], offset: Tensor, means: Tensor) -> list[d
     every element of the list for a camera and its values by their names, so a box is one more value of each.
 
     Convention:
-        Camera to world in the coordinates of the PLY file, OpenCV axes. `rotation` holds the rows of the matrix.
-
-    Args:
-        views: sets of views, listed one after the other.
-        offset: the `offset` of the Scene, `(3,)`, in world units. It is added to the positions in float64.
-        means: centres of the Gaussians, `(N, 3)`, in world units without the offset.
+        Camera to world in the coordinates of the PLY file, OpenCV axes: the `offset` of the Scene is added to the
+        positions in float64. `rotation` holds the rows of the matrix.
 
     Returns:
         One dict per view: id (counted from 0), img_name, width, height, fx and fy (pixels), position (world units),
         rotation, and bounds (two opposite corners of a box, in world units; beyond each of its sides lies a hundredth
-        of the centres that are not in a sky; not without Gaussians).
+        of the centres of Gaussians, `means` `(N, 3)`, that are not in a sky; not without Gaussians).
     """
-    box = {"bounds": _bounds(means, offset)} if len(means) else {}
+    box = {}
+    if len(means):
+        points = means.detach().double().cpu().numpy()
+        distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+        near = points[distances <= _DISTANT * np.median(distances)]
+        corners = np.quantile(near, [_OUTSIDE, 1 - _OUTSIDE], axis=0) + offset.double().cpu().numpy()
+        box = {"bounds": corners.tolist()}
     entries = list[dict[str, Any]]()
     for part in views:
         height, width = part.images.shape[-2:]
@@ -60,25 +62,11 @@ def camera_list(views: Sequence[Views], offset: Tensor, means: Tensor) -> list[d
     return entries
 
 
-def _bounds(means: Tensor, offset: Tensor) -> list[list[float]]:
-    """Two opposite corners of a box around the centres `(N, 3)`, N >= 1, without a sky and without strays."""
-    points = means.detach().double().cpu().numpy()
-    distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-    near = points[distances <= _DISTANT * np.median(distances)]
-    corners = np.quantile(near, [_OUTSIDE, 1 - _OUTSIDE], axis=0) + offset.double().cpu().numpy()
-    bounds: list[list[float]] = corners.tolist()
-    return bounds
-
-
 def rolled(views: Views, degrees: float) -> Views:
     """The views with their pictures turned clockwise, such that photos which lie on their side stand upright.
 
-    The cameras roll about their optical axes: they still show the same of the scene. Whole quarter turns turn the frame
-    too; what is left of the angle, up to 45 degrees, tilts the scene within the frame.
-
-    Args:
-        views: with pinhole cameras.
-        degrees: the angle, in [-360, 360]; positive is clockwise for who looks at a picture.
+    The pinhole cameras roll about their optical axes: they still show the same of the scene. Whole quarter turns turn
+    the frame too; what is left of the angle, up to 45 degrees, tilts the scene within the frame.
     """
     if not degrees or not len(views):
         return views
@@ -125,12 +113,7 @@ def upright(extrinsics: Tensor) -> Tensor:
     Convention:
         The axes of glTF: y is up, and the mean viewing direction of the cameras, made horizontal, is -z. If the viewing
         directions cancel out, that of the first camera is used; if it is vertical, z is any horizontal direction.
-
-    Args:
-        extrinsics: world-to-camera, OpenCV axes, `(V, 4, 4)`, V >= 1.
-
-    Returns:
-        A rotation, `(3, 3)` float64.
+        `extrinsics` are world-to-camera with OpenCV axes, `(V, 4, 4)`, V >= 1; the rotation is `(3, 3)` float64.
     """
     up = common_up(extrinsics)
     forward = extrinsics[:, 2, :3].double().cpu()

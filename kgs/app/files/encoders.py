@@ -49,12 +49,8 @@ def encode(path: Path, frames: Iterable[Frame], size: tuple[int, int]) -> str:
     """Write frames as a film, MP4 or WebM by the suffix. A frame is encoded while the next ones are made.
 
     MP4 is H.264 of the main profile or below, yuv420p in BT.709, with its index in front, so that it plays on phones
-    and while it is loaded. (OpenCV's VP9 encoder takes six times as long as VP8 for 0.5 dB.)
-
-    Args:
-        path: the file to write.
-        frames: `(height, width, 3)` each, BGR.
-        size: width and height, even numbers.
+    and while it is loaded. (OpenCV's VP9 encoder takes six times as long as VP8 for 0.5 dB.) Frames are BGR,
+    `(height, width, 3)`; `size` is width and height, even numbers.
 
     Returns:
         "", or the reason why there is no such film; what is at `path` then is not one.

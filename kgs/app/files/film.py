@@ -38,26 +38,24 @@ def write_film(
     path: str | os.PathLike[str],
     render: Callable[[PinholeCamera], Tensor],
     views: Views,
-    depth: float,
+    depth: float,  # from the cameras to the scene, in world units
     bar: ProgressBar = silent,
 ) -> str:
     """Write a film along the :func:`camera_path` through some views, as MP4 or WebM by the suffix. The write is atomic.
 
     The film has `FRAMES` frames at `RATE` frames per second; see :func:`resample_by_speed` for its speed. Frames have
-    the size of the views, reduced to at most `LONGEST` pixels and rounded to even numbers.
-
-    Args:
-        path: the file to write, in an existing folder; see :func:`kgs.app.files.encoders.film_suffix`.
-        render: from a camera to an image `(1, 3, H, W)`.
-        views: the views whose cameras the path passes.
-        depth: distance from the cameras to the scene, in world units.
-        bar: wraps the loops to show their progress, see :mod:`kgs._support.progress`.
+    the size of the views, reduced to at most `LONGEST` pixels and rounded to even numbers, and the mean of their
+    intrinsics. `render` makes an image `(1, 3, H, W)` of a camera.
 
     Returns:
         "", or the reason why no film was written: there is no encoder for it here.
     """
     path = Path(path)
-    camera = _frame_camera(views)
+    height, width = views.images.shape[-2:]
+    shrink = min(1.0, LONGEST / max(height, width))
+    size = (max(2, 2 * round(height * shrink / 2)), max(2, 2 * round(width * shrink / 2)))
+    camera = pinhole_cameras(views.cameras.extrinsics[:1], views.cameras.intrinsics.mean(0), width, height)
+    camera = resized(camera, (size[1] / width, size[0] / height), size)
     poses = resample_by_speed(views.cameras.extrinsics, FRAMES, depth).to(camera.extrinsics)
     part = path.with_name(f".{path.name}")  # OpenCV chooses the format by the suffix
     frames = (posed(camera, pose[None]) for pose in bar(list(poses), "film", "frame"))
@@ -75,24 +73,10 @@ def write_film(
 def path_near_plane(means: Tensor, cameras: PinholeCamera, near_plane: float) -> float:
     """The near plane of a camera beside those of the photos, in world units: half of the nearest typical depth.
 
-    A path between the photos' cameras can lead through Gaussians that no photo has before it there. They would fill
-    the picture.
-
-    Args:
-        means: centres of the Gaussians, `(N, 3)`, in world units.
-        cameras: of the training photos.
-        near_plane: of the fit, in world units, which the result is not below.
+    A path between the photos' cameras can lead through Gaussians, `means` `(N, 3)`, that no photo has before it there.
+    They would fill the picture. It is not below the near plane of the fit.
     """
     return max(near_plane, _CLEAR * typical_depths(means, cameras)[0])
-
-
-def _frame_camera(views: Views) -> PinholeCamera:
-    """A camera of the frames' size, with the mean intrinsics of the views."""
-    height, width = views.images.shape[-2:]
-    shrink = min(1.0, LONGEST / max(height, width))
-    size = (max(2, 2 * round(height * shrink / 2)), max(2, 2 * round(width * shrink / 2)))
-    camera = pinhole_cameras(views.cameras.extrinsics[:1], views.cameras.intrinsics.mean(0), width, height)
-    return resized(camera, (size[1] / width, size[0] / height), size)
 
 
 def resample_by_speed(extrinsics: Tensor, frames: int, depth: float) -> Tensor:
@@ -102,16 +86,10 @@ def resample_by_speed(extrinsics: Tensor, frames: int, depth: float) -> Tensor:
     turns, as the hypotenuse of both. The film begins and ends at rest, with the same acceleration over the first and
     last `_RAMP` of the path. Where the path turns back, as at the end of a row of cameras, the camera slows down.
 
+    The first pose is that of a camera; after the last one the path would be there again.
+
     Convention:
-        World-to-camera extrinsics, OpenCV axes, in and out.
-
-    Args:
-        extrinsics: `(V, 4, 4)`, V >= 1.
-        frames: number of poses, >= 1. The first is that of a camera; after the last one the path would be there again.
-        depth: distance from the cameras to the scene, in world units.
-
-    Returns:
-        `(frames, 4, 4)`, float64.
+        World-to-camera extrinsics with OpenCV axes, `(V, 4, 4)` in, V >= 1, and `(frames, 4, 4)` float64 out.
     """
     even = np.linspace(0, 1, _PIECES + 1)
     path = torch.linalg.inv(camera_path(extrinsics, even, depth))
@@ -152,19 +130,15 @@ def camera_path(extrinsics: Tensor, shares: Array, depth: float) -> Tensor:
     than twelve, some cameras are skipped.
 
     Convention:
-        World-to-camera extrinsics, OpenCV axes, in and out. The first pose is that of one of the cameras.
-
-    Args:
-        extrinsics: `(V, 4, 4)`, V >= 1.
-        shares: `(frames,)`, of the path, in [0, 1]: 0 is its beginning and 1 the same point again, its end.
-        depth: distance from the cameras to the scene, in world units; used for a single camera.
-
-    Returns:
-        `(frames, 4, 4)`, float64.
+        World-to-camera extrinsics with OpenCV axes, `(V, 4, 4)` in, V >= 1, and `(frames, 4, 4)` float64 out. A share
+        of the path, `(frames,)`, is in [0, 1]: 0 is its beginning, a camera, and 1 the same point again, its end.
     """
     poses = torch.linalg.inv(extrinsics.double().cpu())  # camera to world
-    if len(poses) == 1:
-        return _sway(poses[0], shares, depth)
+    if len(poses) == 1:  # a small ellipse beside it, looking at the point at `depth` on its optical axis
+        angles = 2 * torch.pi * torch.from_numpy(shares)
+        right, down, forward = poses[0, :3, :3].T
+        offsets = _SWAY * depth * (angles.sin()[:, None] * right + 0.4 * (1 - angles.cos())[:, None] * down)
+        return _extrinsics(poses[0, :3, 3] + offsets, _looking_at(depth * forward, offsets, down))
     order = _round_trip(_distances(poses))
     order = [order[i] for i in np.linspace(0, len(order), min(_STOPS, len(order)), endpoint=False).astype(int)]
     centers = poses[order, :3, 3]
@@ -192,14 +166,6 @@ def _distances(poses: Tensor) -> Array:
     turned = np.arccos((forward @ forward.T).clip(-1, 1))
     distances: Array = moved / (moved.max() or 1.0) + turned / np.pi
     return distances
-
-
-def _sway(pose: Tensor, shares: Array, depth: float) -> Tensor:
-    """Poses on a small ellipse beside one camera, looking at the point at `depth` on its optical axis."""
-    angles = 2 * torch.pi * torch.from_numpy(shares)
-    right, down, forward = pose[:3, :3].T
-    offsets = _SWAY * depth * (angles.sin()[:, None] * right + 0.4 * (1 - angles.cos())[:, None] * down)
-    return _extrinsics(pose[:3, 3] + offsets, _looking_at(depth * forward, offsets, down))
 
 
 def _looking_at(target: Tensor, centers: Tensor, down: Tensor) -> Tensor:

@@ -45,14 +45,8 @@ def save_glb(
         glTF's: y is up, lengths are metres. The values are those of the model, in its own frame and in float32. The
         rotation and translation of the node make the scene upright; readers rotate the harmonics with the node.
         Quaternions are x, y, z, w of length 1. Scales are standard deviations. Opacities are in [0, 1]. Colours are
-        sRGB.
-
-    Args:
-        path: the file to write, in an existing folder.
-        model: the Gaussians.
-        rotation: from the model's world to glTF's, `(3, 3)`, as :func:`kgs.app.files.cameras.upright` gives.
-        offset: the origin of the model's frame in its world, `(3,)`: the `offset` of a Scene. It becomes the node's
-            translation. None: zero.
+        sRGB. `rotation` `(3, 3)` is that of :func:`kgs.app.files.cameras.upright`; `offset` `(3,)`, that of a Scene,
+        becomes the node's translation.
 
     Raises:
         TypeError: `model` is not a GaussianModel.
@@ -114,14 +108,8 @@ def _mesh(attributes: dict[str, NDArray[np.float32]]) -> dict[str, Any]:
     start = 0
     for i, values in enumerate(attributes.values()):
         buffer_views.append({"buffer": 0, "byteOffset": start, "byteLength": values.nbytes, "target": _ARRAY_BUFFER})
-        accessors.append(
-            {
-                "bufferView": i,
-                "componentType": _FLOAT,
-                "count": len(values),
-                "type": _TYPES[values.shape[1]],
-            }
-        )
+        kind = {"componentType": _FLOAT, "count": len(values), "type": _TYPES[values.shape[1]]}
+        accessors.append({"bufferView": i, **kind})
         start += values.nbytes
     positions = attributes["POSITION"]
     box = {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
@@ -135,10 +123,15 @@ def _attributes(model: GaussianModel) -> dict[str, NDArray[np.float32]]:
         gaussians = model()
         opacities = gaussians.opacities[:, None]
         harmonics = gaussians.colors
+        srgb = (SH_C0 * harmonics[:, 0].double() + 0.5).clamp(0, 1)
+        linear = rgb_to_linear_rgb(srgb.T[..., None])[..., 0].T  # which COLOR_0 requires; the model's colours are sRGB
+        quats = gaussians.quats.double()
+        norms = quats.norm(dim=1, keepdim=True)
+        units = torch.where(norms > 0, quats / norms, quats.new_tensor([1.0, 0.0, 0.0, 0.0]))  # w, x, y, z
         attributes = {
             "POSITION": gaussians.means,
-            "COLOR_0": torch.cat([_linear_colors(harmonics), opacities], 1),
-            f"{_EXTENSION}:ROTATION": _unit_quaternions(gaussians.quats)[:, [1, 2, 3, 0]],
+            "COLOR_0": torch.cat([linear, opacities], 1),
+            f"{_EXTENSION}:ROTATION": units[:, [1, 2, 3, 0]],
             f"{_EXTENSION}:SCALE": gaussians.scales,
             f"{_EXTENSION}:OPACITY": opacities,
         }
@@ -146,20 +139,6 @@ def _attributes(model: GaussianModel) -> dict[str, NDArray[np.float32]]:
             degree = math.isqrt(k)
             attributes[f"{_EXTENSION}:SH_DEGREE_{degree}_COEF_{k - degree**2}"] = harmonics[:, k]
     return {name: np.ascontiguousarray(values.detach().cpu().numpy(), "<f4") for name, values in attributes.items()}
-
-
-def _unit_quaternions(quats: Tensor) -> Tensor:
-    """Quaternions w, x, y, z of length 1 in float64; a quaternion of zeros becomes the identity."""
-    quats = quats.double()
-    norms = quats.norm(dim=1, keepdim=True)
-    return torch.where(norms > 0, quats / norms, quats.new_tensor([1.0, 0.0, 0.0, 0.0]))
-
-
-def _linear_colors(harmonics: Tensor) -> Tensor:
-    """The colours of degree 0 as linear RGB, which COLOR_0 requires, `(N, 3)` float64; the model's are sRGB."""
-    srgb = (SH_C0 * harmonics[:, 0].double() + 0.5).clamp(0, 1)
-    linear: Tensor = rgb_to_linear_rgb(srgb.T[..., None])[..., 0].T
-    return linear
 
 
 def _chunk(kind: bytes, content: bytes) -> bytes:

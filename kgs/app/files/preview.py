@@ -22,12 +22,7 @@ _QUALITY = 90  # of the JPEG
 def write_preview(path: Path, render: Callable[[PinholeCamera], Tensor], views: Views) -> None:
     """Write what the camera nearest the middle of all sees, as a JPEG of 1200 x 630 pixels. The write is atomic.
 
-    The middle of its photo is shown, as much of it as fills that shape.
-
-    Args:
-        path: the file to write.
-        render: from a camera to an image `(1, 3, H, W)`.
-        views: the views, at least one.
+    The middle of its photo is shown, as much of it as fills that shape. `render` makes an image `(1, 3, H, W)`.
     """
     centers = camera_centers(views.cameras.extrinsics)
     nearest = int((centers - centers.mean(0)).norm(dim=1).argmin())

@@ -42,17 +42,11 @@ class Results:
     def open(
         cls, out: Path, kind: str, beside: Sequence[str] = (), resume: bool = True, marks: Sequence[str] = ()
     ) -> Iterator[Self]:
-        """Hold a folder for results until the block ends.
+        """Hold a folder for results until the block ends: one that is new, empty, or has results of this kind.
 
-        Args:
-            out: new, empty, or a folder of results of this kind.
-            kind: of the results: "fit", "photos", "renders", "scale", "bench" or "study".
-            beside: other kinds that may be there.
-            resume: whether an unfinished fit may be there.
-            marks: files that tell a folder of results as its marker does.
-
-        Raises:
-            DataError: `out` is another folder, cannot be written to, or kgs is at work there.
+        The kind is "fit", "photos", "renders", "scale", "bench" or "study", of which others may be `beside` it; `marks`
+        are files that tell a folder of results as its marker does. With `resume` an unfinished fit may be there. A
+        DataError about another folder, one that cannot be written to, or one where kgs is at work.
         """
         _check_folder(out, {MARKER, *marks})
         if others := sorted(set(read_marker(out)).difference([kind, *beside])):

@@ -25,23 +25,16 @@ _DIGITS = 6  # of a position, after the point, in depths of the scene
 
 
 def viewer_scene(
-    cameras: PinholeCamera,
-    names: Sequence[str],
-    parts: Sequence[str],
-    means: Tensor,
-    psnr: Mapping[str, float] | None = None,
+    cameras: PinholeCamera,  # their skew is ignored
+    names: Sequence[str],  # the file names of their photos
+    parts: Sequence[str],  # what each photo was used for: "training", "test", or another word
+    means: Tensor,  # centres of the Gaussians; the viewer orbits a point at their median depth
+    psnr: Mapping[str, float] | None = None,  # of the renders of photos, in dB, by their names, if it is known
 ) -> dict[str, Any]:
     """The cameras, the one to open at, the upright direction and the size of the pyramids, as plain numbers for JSON.
 
     Convention:
         OpenCV axes, integer pixel centres. A rotation's rows are right, down and forward in the world.
-
-    Args:
-        cameras: the C cameras; their skew is ignored.
-        names: the file names of their C photos.
-        parts: what each photo was used for: "training", "test", or another word.
-        means: centres of the Gaussians, `(N, 3)`, in world units. The viewer orbits a point at their median depth.
-        psnr: of the renders of photos, in dB, by their names, as far as it is known.
 
     Returns:
         cameras: for each camera its name, part, label (its photo's number in the order of names), size (width, height),
@@ -82,17 +75,14 @@ def viewer_scene(
     rotations = np.array([camera["rotation"] for camera in entries])
     training = are_training(parts)
     middle = _nearest_mean_pose(rotations, positions / depth, training)
-    known = psnr or {}
-    first = max(middle[: math.ceil(len(middle) / 3)], key=lambda i: known.get(names[i], -math.inf))
+    first = max(middle[: math.ceil(len(middle) / 3)], key=lambda i: (psnr or {}).get(names[i], -math.inf))
     distance = entries[first]["distance"]
-    up = common_up(cameras.extrinsics)
     return {
         "cameras": entries,
         "first": first,
-        "up": up.tolist(),
         "pyramid": _pyramid_depth(positions, depth),
-        "arc": _arc(rotations, positions, first, distance, up.numpy()),
-        "turned": [_turned(cameras, quarters, positions, first, distance) for quarters in (1, 2, 3)],
+        **_up_and_arc(cameras, positions, first, distance),
+        "turned": [_up_and_arc(turned(cameras, quarters), positions, first, distance) for quarters in (1, 2, 3)],
         "tour": _tour(training_cameras(cameras, parts), means),
     }
 
@@ -111,10 +101,7 @@ def training_cameras(cameras: PinholeCamera, parts: Sequence[str]) -> PinholeCam
 def _nearest_mean_pose(rotations: Array, positions: Array, training: Sequence[bool]) -> list[int]:
     """Indices of the training cameras, those first whose poses are nearest the mean of the training poses.
 
-    Args:
-        rotations: world to camera, `(C, 3, 3)`.
-        positions: `(C, 3)`, in depths of the scene: to move by 0.1 of the depth counts about as much as to turn by 0.1.
-        training: which cameras took training photos, C values.
+    Positions are in depths of the scene: to move by 0.1 of the depth counts about as much as to turn by 0.1.
     """
     chosen = np.flatnonzero(training)
     # Rotation matrices that differ by a small angle have a distance of sqrt(2) times it.
@@ -157,11 +144,11 @@ def _arc(rotations: Array, positions: Array, first: int, distance: float, up: Ar
     }
 
 
-def _turned(cameras: PinholeCamera, quarters: int, positions: Array, first: int, distance: float) -> dict[str, Any]:
-    """What is up, and the arc of the cameras, where all pictures are turned clockwise by some quarters."""
-    poses = turned(cameras, quarters).extrinsics
-    up = common_up(poses)
-    return {"up": up.tolist(), "arc": _arc(poses[:, :3, :3].numpy(), positions, first, distance, up.numpy())}
+def _up_and_arc(cameras: PinholeCamera, positions: Array, first: int, distance: float) -> dict[str, Any]:
+    """What is up for these cameras, and their arc."""
+    up = common_up(cameras.extrinsics)
+    arc = _arc(cameras.extrinsics[:, :3, :3].numpy(), positions, first, distance, up.numpy())
+    return {"up": up.tolist(), "arc": arc}
 
 
 def _widened(low: float, high: float) -> list[float]:

@@ -51,19 +51,11 @@ _TARGET_SHARE = 0.97  # share of the limit to aim at when Gaussians are left out
 
 
 class Packed(NamedTuple):
-    """A packed splat.
+    """A packed splat."""
 
-    Args:
-        layout: what a viewer needs to decode the content: `count`, `degree` of the harmonics, and `columns` with the
-            name, width, low and step of each.
-        content: the planes of all columns as one gzip file.
-        reduced: strays that were left out, and what was reduced to respect the limit of size, in words that follow "it
-            shows"; "" for nothing.
-    """
-
-    layout: dict[str, Any]
-    content: bytes
-    reduced: str = ""
+    layout: dict[str, Any]  # `count`, `degree` of the harmonics, and `columns` with the name, width, low, step of each
+    content: bytes  # the planes of all columns as one gzip file
+    reduced: str = ""  # strays that were left out, and what the limit of size reduced, in words that follow "it shows"
 
 
 class Column(NamedTuple):
@@ -82,29 +74,19 @@ class Column(NamedTuple):
 
 
 def pack(
-    gaussians: Gaussians,
-    cameras: PinholeCamera,
-    max_bytes: int,
+    gaussians: Gaussians,  # with harmonics, or RGB colours `(N, 3)`
+    cameras: PinholeCamera,  # of the page: positions get as many bits as their images need, see `PIXEL_ERROR`
+    max_bytes: int,  # of the content
     weights: Callable[[], Tensor] | None = None,
     near_plane: float = RasterOptions.near_plane,
 ) -> Packed:
-    """Pack Gaussians into at most `max_bytes` bytes.
+    """Pack Gaussians into at most `max_bytes` bytes; an ArgumentError if not even one fits.
 
     Invisible Gaussians are always left out: those that are not finite, or have an opacity below the alpha threshold. So
     are strays, which are more than 100 000 times as far from the middle as Gaussians or cameras are in the median; what
     lies nearer may be seen when an eye turns, and stays. If the rest is too large, first the numbers get fewer bits,
-    then the harmonics a lower degree, and only then are Gaussians left out.
-
-    Args:
-        gaussians: with harmonics, or RGB colours `(N, 3)`.
-        cameras: the cameras of the page. Positions get as many bits as their images need, see `PIXEL_ERROR`.
-        max_bytes: limit for the content of the result.
-        weights: returns the contribution of each Gaussian, `(N,)`; those with the smallest are left out first. It is
-            called only if Gaussians must be left out. None: opacity times area.
-        near_plane: of the renderer, in world units.
-
-    Raises:
-        ValueError: not even one Gaussian fits.
+    then the harmonics a lower degree, and only then are Gaussians left out: those first whose contribution is the
+    smallest, which `weights` returns, `(N,)`. Without it that is opacity times area.
     """
     values, visible = _visible(gaussians)
     values = {name: value.astype(np.float64) for name, value in values.items()}
@@ -119,7 +101,11 @@ def pack(
     for packed, reductions in _with_all_gaussians(values, cameras, near_plane, degree):
         if len(packed.content) <= max_bytes:
             return packed._replace(reduced=", ".join(words + reductions))
-    contributions = _opacity_times_area(values) if weights is None else weights().detach().cpu().double().numpy()[rows]
+    if weights is None:
+        scales = np.sort(values["scales"], axis=1)
+        contributions = values["opacities"] * scales[:, 1] * scales[:, 2]
+    else:
+        contributions = weights().detach().cpu().double().numpy()[rows]
     order = np.argsort(-contributions, kind="stable")
     count = len(rows)
     while len(packed.content) > max_bytes:
@@ -275,13 +261,6 @@ def _pixels_per_unit(means: Array, cameras: PinholeCamera, near_plane: float) ->
             shifts = k.diagonal()[:2].abs().max() / depths[seen, 0] * (1 + tangents.square().sum(1)).sqrt()
             maximum = max(maximum, float(shifts.max()))
     return maximum
-
-
-def _opacity_times_area(values: dict[str, Array]) -> Array:
-    """The opacity of each Gaussian times the largest area that it can cover."""
-    scales = np.sort(values["scales"], axis=1)
-    product: Array = values["opacities"] * scales[:, 1] * scales[:, 2]
-    return product
 
 
 def _morton_order(means: Array) -> NDArray[np.intp]:

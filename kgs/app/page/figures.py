@@ -76,7 +76,8 @@ def verdict(runs: Runs) -> str:
     text = f"PSNR on {which}: not measured."
     if levels:
         numbers = ", ".join(with_run(f"{level:.1f} dB", run).replace(", ", " ") for run, level in levels.items())
-        words = f", that is {_in_words(list(levels.values())[-1])}" if part in ("test", "held_out") else ""
+        in_words = next(words for minimum, words in _LEVELS if list(levels.values())[-1] >= minimum)
+        words = f", that is {in_words}" if part in ("test", "held_out") else ""
         text = f"PSNR on {which}: {numbers}{words}."
     if part == "held_out":
         return f"{text} This splat was trained on all photos."
@@ -85,11 +86,6 @@ def verdict(runs: Runs) -> str:
     unknown = "No photo was held out, so how good new views are was not measured"
     little = " That says little: it was made to show them." if levels else ""
     return f"{unknown} (kgs fit with --measure or --hold-out does). {text}{little}"
-
-
-def _in_words(psnr: float) -> str:
-    """What a PSNR looks like, see `_LEVELS`."""
-    return next(words for minimum, words in _LEVELS if psnr >= minimum)
 
 
 def measure_table(runs: Runs) -> tuple[list[str], list[list[str]]]:

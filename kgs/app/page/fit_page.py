@@ -1,9 +1,8 @@
 """The page of a fit, index.html: collects the content for :func:`kgs.app.page.write_page` from a fit and its files."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -40,56 +39,46 @@ _BORDER = 0.03  # of the shorter side of a photo: the band whose mean is the gro
 def write_fit_page(
     path: Path,
     title: str,
-    fits: Mapping[str, Fit],
+    fits: Mapping[str, Fit],  # of one scene, with metrics, by the name of the run; "" for a single one
     *,
     beside: Views | None = None,
-    words: tuple[str, str] = ("training", "test"),
+    words: tuple[str, str] = ("training", "test"),  # what training and test views are called
     notes: Sequence[str] = (),
     remarks: Sequence[str] = (),
-    settings: Mapping[str, Any] | None = None,
-    report: Path | None = None,
-    photos: bool = True,
-    roll: float = 0.0,
-    small: Views | None = None,
+    settings: Mapping[str, Any] | None = None,  # the content of config.json
+    report: Path | None = None,  # photos.json, if it is there and can be read
+    photos: bool = True,  # whether the page shows photos, renders and their differences
+    roll: float = 0.0,  # degrees by which all pictures are turned clockwise
+    small: Views | None = None,  # some of the views with pixels, for the thumbnails; None: those of the scene
 ) -> str:
     """Write the page of one or more fits of a scene; the viewer shows the last of them.
 
-    Args:
-        path: the file to write.
-        title: of the page.
-        fits: of one scene, with metrics, by the name of the run; "" for a single one.
-        beside: the views to show beside their renders; only these need pixels. None: up to `MAX_PICTURES` test views,
-            or training views if there are no test views.
-        words: what training and test views are called.
-        notes: sentences to show below the one that says how good the fit is.
-        remarks: sentences to show under Details.
-        settings: the content of config.json.
-        report: a JSON file about how the cameras were found; ignored if it does not exist or cannot be read.
-        photos: whether the page shows photos, renders and their differences.
-        roll: degrees by which all pictures are turned clockwise, see :func:`kgs.app.files.cameras.rolled`.
-        small: some of the views with pixels, for the thumbnails. None: those of the scene.
+    The views `beside` their renders need pixels, others do not. Unless given, they are up to `MAX_PICTURES` test views,
+    or training views if there are no test views.
 
     Returns:
         What the viewer shows less than the model, in words; "" for nothing.
     """
     fit = list(fits.values())[-1]
     scene = fit.scene
-    training_word, test_word = words
-    if len(scene.test):
-        views = scene.test
-        word = test_word
-    else:
-        views = scene.train
-        word = training_word
+    views, word = (scene.test, words[1]) if len(scene.test) else (scene.train, words[0])
     photographed = beside or views.select(spread(len(views), MAX_PICTURES))
     pictured = shown(photographed, roll) if photos else []
+    count = sum(map(len, pictured))
+    kind = "photos" if word == "photo" else f"{word} photos"
     parts = [*shown(scene.train, roll), *shown(scene.test, roll)]
     image_of = _kept_image if beside is None and not roll else _new_image
     thumbnailed = [] if not photos else parts if small is None else shown(small, roll)
+    images = {name: image for part in thumbnailed for name, image in zip(part.names, part.images, strict=True)}
+    names = list(images)
     with torch.no_grad():
         gaussians = fit.model()
     runs = {run: one.metrics for run, one in fits.items()}
     first_run = next(iter(runs.values()))
+    found = dict[str, Any]()
+    if report is not None and report.is_file():
+        with suppress(DataError):
+            found = read_json(report)
     content = PageContent(
         splat=PageSplat(
             gaussians,
@@ -98,19 +87,21 @@ def write_fit_page(
             weights=lambda: contributions(fit.model, scene.train, fit.options, fit.backend),
             offset=scene.offset,
         ),
-        photos=replace(
-            _photos(scene, words, roll),
+        photos=PagePhotos(
+            cameras=joined(*(part.cameras for part in parts)),
+            names=[*scene.train.names, *scene.test.names],
+            parts=[words[0]] * len(scene.train) + [words[1]] * len(scene.test),
             pictures=_pictures(pictured, fits, image_of),
-            pictures_note=_pictures_note(sum(map(len, pictured)), len(views), word),
-            thumbnails=_thumbnails(thumbnailed),
+            pictures_note=f"{count} of {len(views)} {kind}." if count < len(views) else f"The {kind}.",
+            thumbnails={names[i]: images[names[i]] for i in in_strip(names)},
         ),
         text=PageText(
             title,
             runs=runs,
             notes=notes,
-            remarks=[*_remarks(runs), *remarks],
+            remarks=[*(line for run in runs for line in _remarks(run, runs[run])), *remarks],
             settings=_settings(settings or {}, fit.metrics),
-            report=_report_facts(_read_report(report)),
+            report=_report_facts(found),
             left_out=left_out(Decisions.from_dict(first_run.get("decisions") or {})),
         ),
     )
@@ -118,13 +109,7 @@ def write_fit_page(
 
 
 def load_small(source: SceneSource, scene: Scene, background: str) -> Views:
-    """Load the photos of the strip of thumbnails, in a small size.
-
-    Args:
-        source: the folder of the scene.
-        scene: the scene without its photos; all views are training views.
-        background: "black" or "white".
-    """
+    """The photos of the strip of thumbnails, in a small size, of a scene that was loaded without its photos."""
     count = len(in_strip(scene.train.names))
     shrink = max(1.0, min(source.photo_size()) / _SMALL_PIXELS)
     return load_scene(source, count, shrink, hold_out=0, background=background).train
@@ -138,35 +123,19 @@ def write_own_page(
     settings: Mapping[str, Any],
     remarks: Sequence[str] = (),
 ) -> None:
-    """Write the page of a fit into a folder that has its other files.
-
-    Args:
-        folder: for the page.
-        out: where the files of the fit belong.
-        fit: with metrics.
-        request: how the scene was loaded.
-        settings: the content of config.json.
-        remarks: sentences to show under Details.
-    """
+    """Write the page of a fit with metrics into a folder, whose files belong to `out`; see :func:`write_fit_page`."""
+    full_side = request.full_side(fit.scene)
+    side = max(fit.scene.train.images.shape[-2:])
+    finer = f"The photos were fitted with {side} pixels on their longer side; kgs fit --detail high takes {full_side}."
     write_fit_page(
         folder / PAGE,
         request.title_of(out),
         {"": fit},
-        remarks=[*remarks, *_finer_note(fit.scene, request)],
+        remarks=[*remarks, *([finer] if full_side else [])],
         settings=settings,
         report=fit.scene.root / CAMERAS_REPORT,
         photos=request.photos,
         roll=request.roll,
-    )
-
-
-def _photos(scene: Scene, words: tuple[str, str], roll: float) -> PagePhotos:
-    """The photos of a scene, none of which is shown."""
-    training_word, test_word = words
-    return PagePhotos(
-        cameras=joined(*(views.cameras for views in (*shown(scene.train, roll), *shown(scene.test, roll)))),
-        names=[*scene.train.names, *scene.test.names],
-        parts=[training_word] * len(scene.train) + [test_word] * len(scene.test),
     )
 
 
@@ -200,29 +169,6 @@ def _new_image(fit: Fit, views: Views, index: int) -> Tensor:
     return views.as_photo(index, views.render(index, fit.render)[0])
 
 
-def _thumbnails(parts: Sequence[Views]) -> dict[str, Tensor]:
-    """The photos of the strip by their names."""
-    photos = {name: image for views in parts for name, image in zip(views.names, views.images, strict=True)}
-    names = list(photos)
-    return {names[i]: photos[names[i]] for i in in_strip(names)}
-
-
-def _read_report(path: Path | None) -> dict[str, Any]:
-    """The content of a JSON file; nothing if it does not exist or cannot be read."""
-    if path is not None and path.is_file():
-        with suppress(DataError):
-            return read_json(path)
-    return {}
-
-
-def _remarks(runs: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Sentences about coverage and moved cameras."""
-    remarks = []
-    for run, metrics in runs.items():
-        remarks += [*_coverage_note(metrics, run), *_poses_note(metrics)]
-    return remarks
-
-
 def _ground(views: Views, background: Tensor) -> Tensor:
     """The colour behind the splat in the viewer, `(3,)`: the mean of the photos' border instead of black.
 
@@ -234,9 +180,7 @@ def _ground(views: Views, background: Tensor) -> Tensor:
     band = math.ceil(_BORDER * min(height, width))
     border = torch.ones(height, width, dtype=torch.bool)
     border[band : height - band, band : width - band] = False
-    usable = torch.ones_like(border) if views.border_mask is None else views.border_mask.cpu() >= 1
-    if views.valid_mask is not None:
-        usable = usable & views.valid_mask.cpu().all(0)
+    usable = torch.ones_like(border) if views.usable is None else views.usable.cpu().all(0)
     rows = border & usable if bool((border & usable).any()) else usable
     ground: Tensor = views.images.cpu()[:, :, rows].mean((0, 2)) if bool(rows.any()) else background
     return ground
@@ -277,40 +221,19 @@ def _report_facts(content: Mapping[str, Any]) -> dict[str, Any]:
     return report
 
 
-def _pictures_note(pictured: int, count: int, word: str) -> str:
-    """Which photos are shown, as "6 of 8 test photos." or "The test photos."."""
-    photos = "photos" if word == "photo" else f"{word} photos"
-    return f"{pictured} of {count} {photos}." if pictured < count else f"The {photos}."
-
-
-def _coverage_note(metrics: Mapping[str, Any], run: str) -> list[str]:
-    """The PSNR of held-out views where training views cover the scene and elsewhere, as a sentence; [] if unknown."""
+def _remarks(run: str, metrics: Mapping[str, Any]) -> Iterator[str]:
+    """Where training views cover the scene, what the PSNR is there, and how far the fit moved its training cameras."""
     covered = metrics.get("seen") or {}
-    if covered.get("psnr") is None or covered.get("psnr_rest") is None:
-        return []
-    sentence = (
-        f"{100 * covered['share']:.0f} % of the area of the held-out photos is covered by two or more training views: "
-        f"PSNR {covered['psnr']:.2f} dB there, {covered['psnr_rest']:.2f} dB elsewhere."
-    )
-    return [f"{run}: {sentence}" if run else sentence]
-
-
-def _poses_note(metrics: Mapping[str, Any]) -> list[str]:
-    """How far a fit moved its training cameras, as a sentence; [] if it did not."""
-    poses = metrics.get("poses")
-    if poses is None:
-        return []
-    mean = f"{poses['degrees']:.2f} degrees and {100 * poses['depths']:.2f} % of the median depth"
-    largest = f"{poses['max_degrees']:.2f} degrees and {100 * poses['max_depths']:.2f} %"
-    return [f"The fit moved the training cameras by {mean} in the mean, and by at most {largest}."]
-
-
-def _finer_note(scene: Scene, request: SceneRequest) -> list[str]:
-    """That a larger fit of the same photos is possible, as a sentence; [] if it is not."""
-    full_side = request.full_side(scene)
-    side = max(scene.train.images.shape[-2:])
-    words = f"The photos were fitted with {side} pixels on their longer side; kgs fit --detail high takes {full_side}."
-    return [words] if full_side else []
+    if covered.get("psnr") is not None and covered.get("psnr_rest") is not None:
+        sentence = (
+            f"{100 * covered['share']:.0f} % of the area of the held-out photos is covered by two or more training "
+            f"views: PSNR {covered['psnr']:.2f} dB there, {covered['psnr_rest']:.2f} dB elsewhere."
+        )
+        yield f"{run}: {sentence}" if run else sentence
+    if poses := metrics.get("poses"):
+        mean = f"{poses['degrees']:.2f} degrees and {100 * poses['depths']:.2f} % of the median depth"
+        largest = f"{poses['max_degrees']:.2f} degrees and {100 * poses['max_depths']:.2f} %"
+        yield f"The fit moved the training cameras by {mean} in the mean, and by at most {largest}."
 
 
 def spread(count: int, max_count: int) -> list[int]:

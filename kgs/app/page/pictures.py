@@ -22,27 +22,16 @@ _THUMBNAIL_SIZES = ((96, 80), (96, 65), (80, 60), (64, 50), (48, 40))  # height 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A photo and its renders.
+    """A photo and its renders."""
 
-    Args:
-        name: file name of the photo.
-        photo: RGB in [0, 1], `(3, H, W)`.
-        renders: RGB, `(3, H, W)`, by the name of the run; "" if there is only one run.
-        caption: text above the images; "": the name.
-    """
-
-    name: str
-    photo: Tensor
-    renders: dict[str, Tensor] = field(default_factory=dict)
-    caption: str = ""
+    name: str  # of the photo's file
+    photo: Tensor  # RGB in [0, 1], `(3, H, W)`
+    renders: dict[str, Tensor] = field(default_factory=dict)  # likewise, by the name of the run; "" if there is one
+    caption: str = ""  # above the images; "": the name
 
 
 def encoded(pictures: Sequence[Picture], max_bytes: int) -> list[dict[str, Any]]:
     """Encode all pictures in the largest size in which their data URIs fit into `max_bytes`, or in the smallest one.
-
-    Args:
-        pictures: photos with their renders.
-        max_bytes: limit for all data URIs together. It can be exceeded in the smallest size.
 
     Returns:
         For each picture its name, its caption, the data URI of its photo, and its renders as tuples of the run, the
@@ -51,7 +40,8 @@ def encoded(pictures: Sequence[Picture], max_bytes: int) -> list[dict[str, Any]]
     rows = list[dict[str, Any]]()
     for side in _LONGER_SIDES:
         rows = [_encoded(picture, side) for picture in pictures]
-        if sum(map(_size, rows)) <= max_bytes:
+        uris = [row["photo"] for row in rows] + [uri for row in rows for _, *both in row["renders"] for uri in both]
+        if sum(map(len, uris)) <= max_bytes:
             break
     return rows
 
@@ -65,27 +55,19 @@ def in_strip(names: Sequence[str]) -> list[int]:
 def thumbnails(photos: Sequence[Tensor], max_bytes: int) -> list[dict[str, Any]]:
     """Encode photos in the largest size in which their data URIs fit into `max_bytes`, or in the smallest one.
 
-    Args:
-        photos: RGB in [0, 1], each `(3, H, W)`.
-        max_bytes: limit for all data URIs together. It can be exceeded in the smallest size.
-
     Returns:
         For each photo its data URI (photo), and its width and height in pixels.
     """
     rows = list[dict[str, Any]]()
     for height, quality in _THUMBNAIL_SIZES:
-        rows = [_thumbnail(photo.detach().cpu().float(), height, quality) for photo in photos]
+        rows = []
+        for photo in photos:
+            shrink = min(1.0, height / photo.shape[-2])
+            size = {"width": max(1, round(photo.shape[-1] * shrink)), "height": max(1, round(photo.shape[-2] * shrink))}
+            rows.append({"photo": _data_uri(photo, max(size.values()), quality), **size})
         if sum(len(row["photo"]) for row in rows) <= max_bytes:
             break
     return rows
-
-
-def _thumbnail(photo: Tensor, height: int, quality: int) -> dict[str, Any]:
-    rows, columns = photo.shape[-2:]
-    shrink = min(1.0, height / rows)
-    width = max(1, round(columns * shrink))
-    height = max(1, round(rows * shrink))
-    return {"photo": _data_uri(photo, max(width, height), quality), "width": width, "height": height}
 
 
 def _encoded(picture: Picture, side: int) -> dict[str, Any]:
@@ -101,12 +83,6 @@ def _encoded(picture: Picture, side: int) -> dict[str, Any]:
         "photo": _data_uri(photo, side),
         "renders": renders,
     }
-
-
-def _size(row: dict[str, Any]) -> int:
-    """Bytes of all data URIs of a picture."""
-    renders = sum(len(render) + len(difference) for _, render, difference in row["renders"])
-    return len(row["photo"]) + renders
 
 
 def _data_uri(image: Tensor, side: int, quality: int = _JPEG_QUALITY) -> str:

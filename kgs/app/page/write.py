@@ -3,7 +3,8 @@
 import base64
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -39,11 +40,6 @@ def write_page(path: Path, content: PageContent, max_bytes: int = MAX_BYTES) -> 
     they are given. The splat is packed into the bytes that the rest of the page leaves, see
     :func:`kgs.app.page.data.pack`.
 
-    Args:
-        path: the file to write.
-        content: what the page shows.
-        max_bytes: limit for the page.
-
     Returns:
         What the viewer shows less than the splat, in words, see :class:`kgs.app.page.data.Packed`; "" for nothing.
 
@@ -71,9 +67,6 @@ class _Page:
 
     Its policy (CSP) names the one script and the one style sheet by their SHA-256. The browser runs and applies no
     other, should a text of the user ever get into the page as code; so elements have no style attributes.
-
-    Args:
-        content: what the page shows.
     """
 
     def __init__(self, content: PageContent) -> None:
@@ -92,8 +85,14 @@ class _Page:
         self._scene = scene | {"offset": [0.0, 0.0, 0.0] if offset is None else offset.tolist()}
         self._settings = _viewer_settings(content.splat, content.photos)
         self._context = _context(content, self._scene)
+        width, height = scene["cameras"][scene["first"]]["size"]
+        sizes = [f":root {{ --aspect: {width} / {height} }}\n"]
+        for one in self._context["strip"]:
+            if "photo" in one:
+                size = f"--width: {one['width']}; --height: {one['height']}"
+                sizes.append(f'[data-camera="{one["index"]}"] {{ {size} }}\n')
         code = {
-            "style": "".join([*map(_file, _STYLES), *_sizes(self._scene, self._context["strip"])]),
+            "style": "".join([*map(_file, _STYLES), *sizes]),
             "script": "".join(map(_file, _SCRIPTS)),
         }
         for kind, text in code.items():
@@ -104,12 +103,7 @@ class _Page:
         self._template = environment.get_template("page.html.jinja")
 
     def html(self, packed: Packed | None = None, page_bytes: int = 0) -> bytes:
-        """The whole file.
-
-        Args:
-            packed: the splat; None leaves it out.
-            page_bytes: the size that the page says it has. The text is equally long for all sizes below 10 MB.
-        """
+        """The whole file, which says that it has `page_bytes`: the text is equally long for all sizes below 10 MB."""
         from markupsafe import Markup
 
         splat = {}
@@ -135,11 +129,13 @@ def _context(content: PageContent, scene: Mapping[str, Any]) -> dict[str, Any]:
     photos = content.photos
     text = content.text
     cameras = scene["cameras"]
+    count = len(cameras)
+    number = _NUMBERS[count - 1] if count <= len(_NUMBERS) else str(count)
     first_run = next(iter(text.runs.values()), {})
     measures_head, measures = measure_table(text.runs)
     return {
         "title": text.title,
-        "lead": f"{_in_words(len(cameras))}. Drag to look around.",
+        "lead": f"{number} photo{'s' if count > 1 else ''}. Drag to look around.",
         "strip": _strip(photos, cameras),
         "has_photos": bool(photos.pictures or photos.thumbnails),
         "version": __version__,
@@ -165,15 +161,6 @@ def _context(content: PageContent, scene: Mapping[str, Any]) -> dict[str, Any]:
 def _file(name: str) -> str:
     """The text of a file of this folder."""
     return resources.files("kgs.app.page").joinpath(name).read_text(encoding="utf-8")
-
-
-def _sizes(scene: Mapping[str, Any], strip: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Rules for the aspect ratio of the stage, that of the first view, and for the sizes of the thumbnails."""
-    width, height = scene["cameras"][scene["first"]]["size"]
-    yield f":root {{ --aspect: {width} / {height} }}\n"
-    for one in strip:
-        if "photo" in one:
-            yield f'[data-camera="{one["index"]}"] {{ --width: {one["width"]}; --height: {one["height"]} }}\n'
 
 
 def _strip(photos: PagePhotos, cameras: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -210,20 +197,6 @@ def _viewer_settings(splat: PageSplat, photos: PagePhotos) -> dict[str, Any]:
     }
 
 
-def _in_words(count: int) -> str:
-    """As "Six photos"."""
-    number = _NUMBERS[count - 1] if count <= len(_NUMBERS) else str(count)
-    return f"{number} photo{'s' if count > 1 else ''}"
-
-
-def _counts(parts: Sequence[str]) -> str:
-    """As "3 training and 2 test", or the number alone if all photos are of one kind."""
-    words = list(dict.fromkeys(parts))
-    if len(words) == 1:
-        return str(len(parts))
-    return " and ".join(f"{list(parts).count(word)} {word}" for word in words)
-
-
 def _camera_facts(cameras: Sequence[Mapping[str, Any]], parts: Sequence[str]) -> dict[str, str]:
     """The number of cameras, the size of their photos and their focal lengths, as text."""
     focal = sorted(camera["focal"][0] for camera in cameras)
@@ -232,8 +205,10 @@ def _camera_facts(cameras: Sequence[Mapping[str, Any]], parts: Sequence[str]) ->
     share = focal[len(focal) // 2] / max(width, height)
     in_order = sorted(cameras, key=lambda camera: camera["name"])
     files = [f"{camera['label']}: {camera['name']}" for camera in in_order] if len(cameras) <= _LISTED else []
+    counts = Counter(parts)
+    each = [f"{count} {word}" for word, count in counts.items()]
     return {
-        "cameras": _counts(parts),
+        "cameras": " and ".join(each) if len(counts) > 1 else str(len(parts)),
         "photo size": f"{width} × {height} pixels",
         "focal length": f"{span} pixels, {share:.2f} of the longer side",
         **({"files": "; ".join(files)} if files else {}),

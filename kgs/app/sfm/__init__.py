@@ -4,15 +4,7 @@ The input is a folder of photos as a phone wrote them, the output a scene that k
 have to agree, and cameras that cannot be trusted are refused: see :mod:`kgs.app.sfm.accept`.
 """
 
-from typing import TYPE_CHECKING
-
-from kgs._support.lazy import lazy_names
-
-if TYPE_CHECKING:
-    from .pose import pose_photos
-
-__all__ = ["pose_photos"]
-
+from kgs._support.lazy import public_names
 
 # folders are looked at without torch
-__getattr__, __dir__ = lazy_names(__name__, {"kgs.app.sfm.pose": ("pose_photos",)})
+__getattr__, __dir__, __all__ = public_names(__name__, __file__)

@@ -77,32 +77,17 @@ class Accepted(NamedTuple):
 
 
 def accepted_cameras(
-    photos: list[Photo],
-    images: Path,
-    masks: Path,
-    work: Path,
-    names: Mapping[str, str],
+    photos: list[Photo],  # all of one size
+    images: Path,  # the folder where they are as PNGs
+    masks: Path,  # that of their masks, which exists if there are any
+    work: Path,  # a folder for what the solvers write
+    names: Mapping[str, str],  # of the photos by those of the PNGs, in the order of `photos`
     seed: int,
     bar: ProgressBar,
-    lap: Callable[[str], None],
+    lap: Callable[[str], None],  # called with the name of each part at its end
     say: Callable[[str], None],
 ) -> Accepted:
-    """The cameras of as many photos as two solvers agree on.
-
-    Args:
-        photos: the photos, all of one size.
-        images: the folder where they are as PNGs.
-        masks: the folder of their masks, which exists if there are any.
-        work: a folder for what the solvers write.
-        names: the names of the photos by those of the PNGs, in the order of `photos`.
-        seed: of the solvers.
-        bar: wraps the loops to show their progress, see :mod:`kgs._support.progress`.
-        lap: called with the name of each part at its end.
-        say: called with each line for the user.
-
-    Raises:
-        PhotosRefused: the photos do not fit together, or not even three cameras can be trusted.
-    """
+    """The cameras of as many photos as two solvers agree on; PhotosRefused if these are not even three."""
     folder = photos[0].path.parent
     size = photos[0].size
     lenses = lenses_of(photos)
@@ -130,13 +115,13 @@ def accepted_cameras(
             kept = {image: name for image, name in kept.items() if name not in rejected}
             solutions, held = consensus.solve(kept)
         lap("cameras")
-    say_left_out(rejected, say)
+    say_rejected(rejected, say)
     forward = went_forward(geometries)
     which, degrees = check(folder, solutions, list(kept.values()), max(size), pairs, forward=forward)
     return Accepted(solutions[which], SOLVERS[which], degrees, held, pairs, rejected)
 
 
-def say_left_out(rejected: Mapping[str, str], say: Callable[[str], None]) -> None:
+def say_rejected(rejected: Mapping[str, str], say: Callable[[str], None]) -> None:
     """Say which photos are left out, and why, a line each."""
     for name, why in rejected.items():
         say(f"left out: {name}: {why}")
@@ -153,11 +138,7 @@ class Consensus:
     pairs: Pairs
 
     def solve(self, names: Mapping[str, str]) -> tuple[Solutions, list[float]]:
-        """What each solver finds, and the focal lengths of the Exif where only these tell them, else [].
-
-        Args:
-            names: those of the photos to register, by those of their images.
-        """
+        """What each solver finds, and the focal lengths of the Exif where only these tell them, else []."""
         free = self._both(lambda i: self._solve(i, names))
         solutions, held = self._hold_focals_in_doubt(free, names)
         if not doubtful(solutions, list(names.values()), self.pairs):
@@ -199,10 +180,10 @@ class Consensus:
 def retry(
     solver: Solver,
     names: Mapping[str, str],
-    focals: Sequence[float],
-    found: Cameras,
-    other: Cameras,
-    photos: Set[str],
+    focals: Sequence[float],  # as of `Solver.solve`
+    found: Cameras,  # by this solver
+    other: Cameras,  # by the other one
+    photos: Set[str],  # to be registered again
 ) -> Cameras:
     """The best of what a solver found and of its further tries, which end as soon as all photos are registered well.
 
@@ -214,20 +195,15 @@ def retry(
 
     A try is judged by what the solver itself sees: how many photos with enough points, then how many points. It is
     never judged by how well it agrees with the other solver: of many tries one would agree by chance.
-
-    Args:
-        solver: whose tries they are.
-        names: as `focals`, see :meth:`kgs.app.sfm.map.Solver.solve`.
-        focals: the focal length of each lens in pixels if they are known; (): they are adjusted.
-        found: what it found.
-        other: what the other solver found.
-        photos: those that are to be registered again.
     """
     best = found
     all_photos = set(names.values())
     is_whole = seen_well(found, all_photos) == all_photos
     tries = min(_MAX_TRIES, max(_MIN_TRIES, _REGISTRATIONS // len(names)))
-    for attempt, pair in enumerate(_first_pairs(solver.database, names, photos)[:tries], 1):
+    matches = {pair: len(first) for pair, (first, _) in verified_matches(solver.database).items() if len(first)}
+    pairs = [pair for pair in matches if names.keys() >= {*pair} and not photos.isdisjoint(map(names.get, pair))]
+    pairs.sort(key=lambda pair: -matches[pair])
+    for attempt, pair in enumerate(pairs[:tries], 1):
         at_least = min(len(seen_well(best, all_photos)) + 1, len(names))
         again = solver.solve(names, focals, attempt=attempt, first_pair=pair, at_least=at_least)
         best = max(best, again, key=_merit)
@@ -239,13 +215,6 @@ def retry(
         again = solver.solve(names, focals, start=start, at_least=len(registered) + 1)
         best = max(best, again, key=_merit)
     return best
-
-
-def _first_pairs(database: Path, names: Mapping[str, str], photos: Set[str]) -> list[tuple[str, str]]:
-    """Pairs of images with one of these photos at least, those with most verified matches first."""
-    counts = {pair: len(first) for pair, (first, _) in verified_matches(database).items() if names.keys() >= {*pair}}
-    own = [pair for pair in counts if counts[pair] and not photos.isdisjoint(names[image] for image in pair)]
-    return sorted(own, key=lambda pair: -counts[pair])
 
 
 def _merit(cameras: Cameras) -> tuple[int, int]:
@@ -275,7 +244,11 @@ def _registered_badly(first: Cameras, second: Cameras, names: Sequence[str], pai
     """The photos that a solver failed to register, that see few points, or whose lens is disputed, and why."""
     left = dict[str, str]()
     registered = [name for name in names if name in first.points and name in second.points]
-    better = max((first, second), key=lambda found: _worst_seen(found, registered))
+
+    def seen(found: Cameras) -> tuple[int, int]:
+        return len(seen_well(found, registered)), min((found.points[name] for name in registered), default=0)
+
+    better = max((first, second), key=seen)
     for name in names:
         advice = what_would_help(name, [other for other in names if other != name], pairs)
         if name not in registered:
@@ -289,11 +262,6 @@ def _registered_badly(first: Cameras, second: Cameras, names: Sequence[str], pai
                 factor = f"{max(ratio, 1 / ratio):.3g}"
                 left[name] = f"two solvers differ by a factor of {factor} about the focal length of its lens"
     return left
-
-
-def _worst_seen(cameras: Cameras, names: Sequence[str]) -> tuple[int, int]:
-    """How many photos see enough points, and how many the worst one sees."""
-    return len(seen_well(cameras, names)), min((cameras.points[name] for name in names), default=0)
 
 
 def _disputed(first: Cameras, second: Cameras, names: Sequence[str]) -> dict[str, str]:
@@ -328,18 +296,8 @@ def check(
 ) -> tuple[int, float]:
     """The index of the cameras that pass the acceptance checks, and the solvers' largest difference in degrees.
 
-    If both pass, it is that of those whose worst photo sees more points.
-
-    Args:
-        folder: of the photos, which errors name.
-        solutions: what the two solvers found.
-        names: the names of all photos.
-        longest: the longer side of the photos in pixels.
-        pairs: verified matches of each pair.
-        forward: whether the camera moved along its view, which is what a refusal then speaks of.
-
-    Raises:
-        PhotosRefused: none pass.
+    If both pass, it is that of those whose worst photo sees more points. If none does, PhotosRefused names the folder;
+    where the camera moved along its view, it speaks of that.
     """
 
     def refuse(reason: str, advice: str) -> NoReturn:

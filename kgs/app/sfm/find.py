@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from kgs._support.errors import DataError, listed, quantity
 from kgs.app.files.results import MARKER
@@ -9,7 +10,6 @@ from kgs.datasets import folders
 from kgs.datasets.folders import (
     HEIC_SUFFIXES,
     IMAGE_SUFFIXES,
-    MASKS,
     MASKS_ARE_IN,
     PICTURE_SUFFIXES,
     UNREADABLE_SUFFIXES,
@@ -19,7 +19,9 @@ from kgs.datasets.folders import (
     list_images,
     list_pictures,
 )
-from kgs.datasets.mask_files import find_mask_files
+
+if TYPE_CHECKING:
+    from kgs.datasets.masks import MaskFiles
 
 MIN_PHOTOS = 3
 MAX_FRAMES = 36  # of a video, where twelve would be too far apart
@@ -80,11 +82,17 @@ def _is_video(path: Path) -> bool:
     return path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".")
 
 
-def notes_on(folder: Path, photos: Sequence[Path], masks: Path | None = None) -> list[str]:
-    """What a folder of photos holds that is not used, a sentence each; `masks` is a folder of masks that is named."""
-    notes = [*folders.unused_files(folder), *_nameless(folder), *_inner(folder, photos, masks)]
-    if called := [path for path in photos if is_like_mask(path)]:
-        notes.append(f"named like masks and taken for photos: {listed_files(called)}: {MASKS_ARE_IN}")
+def notes_on(folder: Path, photos: Sequence[Path], masks: "MaskFiles") -> list[str]:
+    """What a folder of photos holds that is not used, a sentence each."""
+    notes = [*folders.unused_files(folder), *_nameless(folder), *masks.notes(folder, _LISTED)]
+    used = [path.resolve() for path in (*masks.masks.values(), *masks.unused)]
+    inner = [path for path in sorted(folder.iterdir()) if path.is_dir()]
+    inner = [path for path in inner if not any(file.is_relative_to(path.resolve()) for file in used)]
+    called = {path for path in inner if path.suffix.lower() in PICTURE_SUFFIXES}
+    if deeper := [path for path in inner if path in called or (_holds_photos(path) and not (path / MARKER).exists())]:
+        notes.append(f"not looked into, because they are folders: {listed_files(deeper)}")
+    if like_masks := [path for path in photos if is_like_mask(path)]:
+        notes.append(f"named like masks and taken for photos: {listed_files(like_masks)}: {MASKS_ARE_IN}")
     if converted := sorted(_pictures(folder)[1]):
         files = quantity(len(converted), "raw or HEIC file")
         notes.append(f"{files} not used, the JPEG of the same name is: {listed_files(converted)}")
@@ -96,22 +104,8 @@ def _nameless(folder: Path) -> list[str]:
     known = {*list_pictures(folder, PICTURE_SUFFIXES)}
     files = [path for path in sorted(folder.iterdir()) if path not in known]
     pictures = [path for path in files if path.is_file() and holds_picture(path)]
-    return (
-        [f"pictures that are not used, hidden or without a known ending: {listed_files(pictures)}"] if pictures else []
-    )
-
-
-def _inner(folder: Path, photos: Sequence[Path], masks: Path | None) -> list[str]:
-    """A sentence about what is named like masks and not used, and one about other folders that may hold photos."""
-    files = find_mask_files(photos, folder, masks) if photos else None
-    used = [path.resolve() for path in (folder / MASKS, *filter(None, [masks]))]
-    inner = [path for path in sorted(folder.iterdir()) if path.is_dir() and path.resolve() not in used]
-    inner = [path for path in inner if files is None or path not in files.unused]
-    notes = files.notes(folder, _LISTED) if files else []
-    called = {path for path in inner if path.suffix.lower() in PICTURE_SUFFIXES}
-    if deeper := [path for path in inner if path in called or (_holds_photos(path) and not (path / MARKER).exists())]:
-        notes.append(f"not looked into, because they are folders: {listed_files(deeper)}")
-    return notes
+    said = "pictures that are not used, hidden or without a known ending"
+    return [f"{said}: {listed_files(pictures)}"] if pictures else []
 
 
 def _pictures(folder: Path) -> tuple[list[Path], set[Path]]:

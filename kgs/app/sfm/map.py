@@ -6,10 +6,7 @@ were measured (docs/results/cameras). Each step runs on one thread, so that the 
 
 import copy
 import math
-import signal
-import threading
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mode
@@ -18,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .colmap import pycolmap
 from .pycolmap_processes import check_space
 
 MAX_ERROR = 1.5  # largest reprojection error, in pixels
@@ -49,23 +47,6 @@ class Cameras(NamedTuple):
 NO_CAMERAS = Cameras({}, {}, {}, {}, None, 0.0)  # of a solver that registered no photo
 
 
-@contextmanager
-def quiet_pycolmap() -> Iterator[Any]:
-    """The module pycolmap with a silent log, and with the handler of SIGTERM that was there before."""
-    main = threading.current_thread() is threading.main_thread()
-    before = signal.getsignal(signal.SIGTERM)
-    import pycolmap
-
-    if main and before is not None:
-        signal.signal(signal.SIGTERM, before)
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
-    try:
-        yield pycolmap
-    finally:
-        pycolmap.logging.minloglevel = level
-
-
 @dataclass(frozen=True)
 class Solver:
     """COLMAP's mapper with the matches of one database."""
@@ -77,30 +58,21 @@ class Solver:
 
     def solve(
         self,
-        names: Mapping[str, str],
-        focals: Sequence[float] = (),
+        names: Mapping[str, str],  # of the photos to register, by those of the images in the database
+        focals: Sequence[float] = (),  # of each lens in pixels if they are known; (): they are adjusted
         *,
-        attempt: int = 0,
-        first_pair: tuple[str, str] | None = None,
+        attempt: int = 0,  # added to the seed
+        first_pair: tuple[str, str] | None = None,  # images that are registered first; None: the mapper chooses
         start: Cameras | None = None,
-        at_least: int = 0,
+        at_least: int = 0,  # photos that have to be registered; where the first round has fewer, there are none
     ) -> Cameras:
         """Cameras and points of as many photos as can be registered: `NO_CAMERAS` if no pair can be.
 
         Lenses are held while photos are registered, because two photos do not determine them, and adjusted to all of
-        them after that. This is repeated with the lenses that came out until they no longer change.
-
-        Args:
-            names: the names of the photos to register, by those of the images in the database.
-            focals: the focal length of each lens in pixels if they are known; (): they are adjusted.
-            attempt: added to the seed.
-            first_pair: the images in the database that are registered first; None: the mapper chooses.
-            start: cameras of other matches that are there before any photo is registered. Their points are
-                triangulated again, from the matches of the database, and then the cameras are adjusted to these.
-            at_least: how many photos have to be registered; where the first round registers fewer, there are none.
+        them after that. This is repeated with the lenses that came out until they no longer change. With a `start`,
+        cameras of other matches, their points are triangulated from the matches of the database before any photo is
+        registered, and then the cameras are adjusted to these.
         """
-        import pycolmap
-
         best = None
         error = 0.0
         is_held = len(focals) > 0
@@ -149,8 +121,6 @@ class Solver:
 
     def _map_from(self, start: Any, options: Any) -> Any:
         """The reconstruction of the photos whose cameras are known, and of those that its points then register."""
-        import pycolmap
-
         known = self.work / "start"
         known.mkdir(parents=True, exist_ok=True)
         points = pycolmap.triangulate_points(start, self.database, self.images, known, options=options)
@@ -159,8 +129,6 @@ class Solver:
 
     def _run_mapper(self, options: Any, start: str | Path = "") -> Any:
         """The reconstruction with most registered photos, or None. The mapper goes on from `start`."""
-        import pycolmap
-
         try:
             scenes = pycolmap.incremental_mapping(self.database, self.images, self.work, options, start)
         except (RuntimeError, ValueError):  # the mapper gives up
@@ -186,8 +154,6 @@ def cameras_of(reconstruction: Any, names: Mapping[str, str], focal_rise: float)
 
 def _mapper_options(images: list[str], seed: int) -> Any:
     """The settings with which the mapper registers these images of a database."""
-    import pycolmap
-
     options = pycolmap.IncrementalPipelineOptions()
     options.image_names = images
     options.num_threads = options.mapper.num_threads = 1
@@ -210,8 +176,6 @@ def _mapper_options(images: list[str], seed: int) -> Any:
 
 def _reconstruction(file: Any, cameras: Cameras, names: Mapping[str, str]) -> Any:
     """A reconstruction with these cameras and the keypoints of a database; its points are still to be found."""
-    import pycolmap
-
     scene = pycolmap.Reconstruction()
     ids = {image.name: image.image_id for image in file.read_all_images()}
     for lens in cameras.reconstruction.cameras.values():
@@ -257,20 +221,10 @@ def _bundle_adjust(
     *,
     hold_focal: bool,
     hold_distortion: bool = False,
-    factor: float = 1.0,
-    distortion: float | None = None,
+    factor: float = 1.0,  # by which focal lengths are multiplied first
+    distortion: float | None = None,  # at which the radial distortions are held
 ) -> tuple[Any, float]:
-    """A copy, adjusted until it converges, and half its sum of squared errors in pixels.
-
-    Args:
-        reconstruction: pycolmap's.
-        hold_focal: whether focal lengths stay.
-        hold_distortion: whether radial distortions stay.
-        factor: by which focal lengths are multiplied first.
-        distortion: at which the radial distortions are held instead.
-    """
-    import pycolmap
-
+    """A copy, adjusted until it converges, and half its sum of squared errors in pixels."""
     scene = copy.deepcopy(reconstruction)
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False

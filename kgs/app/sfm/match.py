@@ -15,7 +15,8 @@ from torch import Tensor
 from kgs._support.progress import ProgressBar
 from kgs.init_points.keypoints import root_sift
 
-from .read import Photo
+from .colmap import pycolmap
+from .read import DEFAULT_FOCAL, Photo
 from .write import write_images
 
 SMALL = 1000  # pixels of the longer side; SIFT sees smaller photos at twice their size
@@ -25,7 +26,6 @@ ALL_KEYPOINTS = 24_576  # of all photos together, if that leaves each one `MIN_K
 _CONTRAST = 0.01
 _CHUNK = 512  # keypoints compared at once: bounds the memory
 _MIN_MATCHES = 8  # matches of a pair that are worth verifying
-DEFAULT_FOCAL = 0.8  # of the longer side, if Exif does not say it; phones have 0.7 to 0.8
 
 
 class PhotoKeypoints(NamedTuple):
@@ -48,17 +48,7 @@ def find_keypoints(photo: Photo, max_count: int) -> PhotoKeypoints:
 
 
 def write_matches(database: Path, photos: list[Photo], names: list[str], lenses: list[Any], bar: ProgressBar) -> None:
-    """Make a COLMAP database of all photos with their lenses, their keypoints and the matches of each pair.
-
-    Args:
-        database: the file to write.
-        photos: the photos, all of one size.
-        names: their names in the database.
-        lenses: first guesses of their lenses, see :func:`lenses_of`.
-        bar: wraps the loops to show their progress, see :mod:`kgs._support.progress`.
-    """
-    import pycolmap
-
+    """Make a COLMAP database of photos of one size with their lenses, keypoints and the matches of each pair."""
     # The cost of matching grows with the squares of both counts, so many photos get fewer keypoints each.
     max_count = min(MAX_KEYPOINTS, max(MIN_KEYPOINTS, ALL_KEYPOINTS // len(photos)))
     keypoints = [find_keypoints(photo, max_count) for photo in bar(photos, "keypoints", "photo")]
@@ -110,8 +100,6 @@ def exif_focal(photos: list[Photo]) -> float | None:
 
 def lenses_of(photos: list[Photo]) -> list[Any]:
     """First guesses of the photos' lenses, as cameras of pycolmap, in the order of their numbers."""
-    import pycolmap
-
     width, height = photos[0].size
     cameras = []
     for number in range(1 + max(photo.lens for photo in photos)):
@@ -125,8 +113,6 @@ def lenses_of(photos: list[Photo]) -> list[Any]:
 
 def _write_photos(file: Any, photos: list[Photo], names: list[str], lenses: list[Any]) -> list[int]:
     """The ids of the photos, which are written with their lenses."""
-    import pycolmap
-
     rig_ids = []
     for lens in lenses:
         lens.camera_id = file.write_camera(lens)

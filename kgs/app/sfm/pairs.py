@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .colmap import pycolmap
 from .find import MIN_PHOTOS
 from .map import MAX_ERROR
 
@@ -32,8 +33,6 @@ class PairGeometry(NamedTuple):
 
 def verified_matches(database: Path) -> dict[tuple[str, str], tuple[Pixels, Pixels]]:
     """Where the verified matches of each pair are in its two images, by the names that these have in a database."""
-    import pycolmap
-
     matches = {}
     with pycolmap.Database.open(database) as file:
         images = {image.image_id: image.name for image in file.read_all_images()}
@@ -76,12 +75,7 @@ def without_overlap(
     """Photos that cannot help, by their matches alone, and why.
 
     The second of two photos from one place, and photos outside the largest group that overlapping pairs connect, if
-    that is larger than any other.
-
-    Args:
-        names: the names of all photos.
-        pairs: verified matches of each pair.
-        geometries: what the matches of each overlapping pair say about depth.
+    that is larger than any other. `geometries` are those of overlapping pairs.
     """
     left = {
         second: f"it shows the same from the same place as {first}"
@@ -102,13 +96,7 @@ def without_overlap(
 
 
 def why_no_cameras(names: Sequence[str], pairs: Pairs, geometries: Mapping[tuple[str, str], PairGeometry]) -> str:
-    """Why matches fail to give cameras, and what to photograph next, as the advice of an error, or "".
-
-    Args:
-        names: the names of all photos.
-        pairs: verified matches of each pair.
-        geometries: what the matches of each overlapping pair say about depth.
-    """
+    """Why matches fail to give cameras, and what to photograph next, as the advice of an error, or ""."""
     if twins := [pair for pair, geometry in geometries.items() if geometry.shift < _MIN_SHIFT]:
         one, other = twins[0]
         return (

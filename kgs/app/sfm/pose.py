@@ -12,18 +12,19 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import cv2
-import torch
 
 from kgs._support.errors import DataError, printable
 from kgs._support.json_files import read_json, write_json
 from kgs._support.machine import versions
 from kgs._support.progress import ProgressBar, silent
+from kgs._support.torch_threads import torch_on_one_thread
 from kgs.app.console import each, say
 from kgs.app.files.fit_files import has_fit
 from kgs.app.files.outputs import png_names
 from kgs.app.files.results import Results
 from kgs.datasets.folders import CAMERAS_REPORT as REPORT
 from kgs.datasets.image_file import color_notes
+from kgs.datasets.masks import find_masks
 
 from .accept import (
     FOCAL_RANGE,
@@ -33,9 +34,10 @@ from .accept import (
     MIN_RISE,
     Accepted,
     accepted_cameras,
-    say_left_out,
+    say_rejected,
 )
-from .map import Cameras, quiet_pycolmap
+from .find import notes_on
+from .map import Cameras
 from .match import exif_focal
 from .pycolmap_processes import check_space
 from .read import FILM_DIAGONAL, OpenPhoto, Photo, blurred, open_photos, read_photos, unlike_others
@@ -115,34 +117,26 @@ def pose(
 ) -> dict[str, Any]:
     """As :func:`pose_photos`, in a folder that is open.
 
-    Args:
-        source: the photos or the video.
-        results: the folder.
-        seed: of the solvers.
-        masks: the folder of their masks.
-        frames: the number of frames that are taken from a video.
-        for_fit: write new files to `results.work`, until a fit to them is done: a former one in the folder belongs to
-            the former cameras.
-        bar: wraps the loops to show their progress.
-        say: called with each line for the user.
+    New files for a fit are in `results.work` until it is done: a former one in the folder belongs to former cameras.
     """
     if source.video is not None:
         return _pose_video(source.video, results, frames, seed=seed, masks=masks, for_fit=for_fit, bar=bar, say=say)
-    with quiet_pycolmap():  # a missing package is an error before any work
-        pass
     if source.path.resolve().is_relative_to(results.out.resolve()):
         raise DataError(results.out, "", "another folder than that of the photos", advice="choose another folder")
-    opened = open_photos([*source.photos], masks)
+    mask_files = find_masks(source.photos, source.path, masks)
+    for note in notes_on(source.path, source.photos, mask_files):
+        say(note)
+    opened = open_photos(source.photos, mask_files)
     inputs = {
         "settings": SETTINGS,
         "seed": seed,
         "sha256": {photo.name: photo.sha256 for photo in opened},
-        "masks_sha256": {photo.name: sha256(photo.mask.file.load()).hexdigest() for photo in opened if photo.mask},
+        "masks_sha256": {photo.name: sha256(photo.mask.load()).hexdigest() for photo in opened if photo.mask},
     }
     for folder in (results.work, results.out) if for_fit else (results.out,):
         if (report := _reusable_report(folder, inputs)) is not None:
             say(f"cameras: those in {printable(folder)} are of the same {len(opened)} photos and are used again")
-            say_left_out(report.get("left_out", {}), say)
+            say_rejected(report.get("left_out", {}), say)
             return {**report, "reused": True, "folder": str(folder)}
     with _new_folder(results, for_fit) as new:
         report = inputs | find_cameras(opened, new, seed % 2**31, bar, say)
@@ -206,13 +200,13 @@ def find_cameras(
     """
     seconds, lap = _clock()
     unlike = unlike_others(opened)
-    say_left_out(unlike, say)
+    say_rejected(unlike, say)
     opened = [photo for photo in opened if photo.name not in unlike]
     png = png_names([photo.name for photo in opened])
     names = {image: name for name, image in png.items()}
     work = new / "work"
     work.mkdir(parents=True)
-    with quiet_pycolmap(), _one_thread(), report_full_disk(new):
+    with _one_thread(), report_full_disk(new):
         photos = read_photos(opened, bar)
         unsharp = [photo.name for photo in blurred(photos)]
         _say_notes(opened, photos, unsharp, say)
@@ -332,12 +326,10 @@ def report_full_disk(folder: Path) -> Iterator[None]:
 @contextmanager
 def _one_thread() -> Iterator[None]:
     """Run torch and OpenCV on one thread: their rounding depends on the number of threads."""
-    threads_of_torch = torch.get_num_threads()
-    threads_of_opencv = cv2.getNumThreads()
-    torch.set_num_threads(1)
+    before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        yield
+        with torch_on_one_thread():
+            yield
     finally:
-        torch.set_num_threads(threads_of_torch)
-        cv2.setNumThreads(threads_of_opencv)
+        cv2.setNumThreads(before)

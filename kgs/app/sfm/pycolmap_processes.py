@@ -101,13 +101,8 @@ def _write_colmap_matches(
 ) -> None:
     """Write COLMAP's own keypoints and verified matches of photos.
 
-    Args:
-        database: the file to write.
-        images: the folder of the photos.
-        lenses: for each the names of its photos in the folder, and the parameters of the SIMPLE_RADIAL lens where they
-            are known; None: COLMAP guesses them from the files.
-        masks: the folder of their masks, named as the photos with .png behind; None: all of each photo is kept.
-        seed: of the verification.
+    `lenses` are the names of the photos of each, and the parameters of the SIMPLE_RADIAL lens; None: COLMAP guesses
+    them from the files. Masks are named as the photos with .png behind.
     """
     import pycolmap
 

@@ -7,7 +7,7 @@ length differs, by a zoom or another phone, are of a lens of their own. Of photo
 import hashlib
 import math
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -15,29 +15,23 @@ from typing import Any, NamedTuple, Self
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL.ExifTags import Base
 
 from kgs._support.errors import DataError, PhotosRefused
 from kgs._support.progress import ProgressBar
 from kgs.datasets import folders, image_file
 from kgs.datasets.image_file import Image, ImageFile, turn
 from kgs.datasets.images import Intrinsics, reduce
-from kgs.datasets.mask_files import find_mask_files
-from kgs.datasets.masks import Mask, as_masks
+from kgs.datasets.masks import Mask, MaskFiles
 
 from .find import CONVERT, MIN_PHOTOS, listed_files
 
 LONGEST = 1600  # pixels of the longer side, for matching and for what is written
 FILM_DIAGONAL = math.hypot(36, 24)  # mm
-_ORIENTATION = 0x0112
-_FOCAL = 0x920A
-_FOCAL_35 = 0xA405
-_PIXELS_X = 0xA002
-_DENSITY = 0xA20E
-_DENSITY_UNIT = 0xA210
+DEFAULT_FOCAL = 0.8  # of the longer side, if Exif does not say it; phones have 0.7 to 0.8
 _UNITS = {2: 25.4, 3: 10.0, 4: 1.0}  # mm, in which the density of pixels is given
 _LENSES = 0.2, 10.0  # focal lengths over the longer side: a fisheye of 8 mm, a telephoto lens of 360 mm
 _PANORAMA = b"equirectangular"  # in XMP, https://developers.google.com/streetview/spherical-metadata
-_SEAM = 2.0  # how much more than neighbouring columns the first and the last one of a panorama may differ
 _SAME_ZOOM = 1.1  # largest ratio of focal lengths that counts as one lens without zoom
 _KERNEL = 33  # pixels of the smoothing, four standard deviations to each side
 _BLURRED = 0.5  # a photo below this share of the median sharpness is blurred
@@ -56,12 +50,12 @@ class Exif(NamedTuple):
     @classmethod
     def of(cls, tags: Mapping[int, Any]) -> Self:
         """Read it from an image's tags. A damaged tag counts as missing."""
-        orientation = int(_number(tags, _ORIENTATION))
-        film = _number(tags, _FOCAL_35)
-        focal = _number(tags, _FOCAL)
-        density = _number(tags, _DENSITY)
-        width = _number(tags, _PIXELS_X)
-        unit = _UNITS.get(int(_number(tags, _DENSITY_UNIT) or 2), 0.0)
+        orientation = int(_number(tags, Base.Orientation))
+        film = _number(tags, Base.FocalLengthIn35mmFilm)
+        focal = _number(tags, Base.FocalLength)
+        density = _number(tags, Base.FocalPlaneXResolution)
+        width = _number(tags, Base.ExifImageWidth)
+        unit = _UNITS.get(int(_number(tags, Base.FocalPlaneResolutionUnit) or 2), 0.0)
         ratio = focal * density / (unit * width) if unit and width else 0.0
         return cls(orientation if 1 <= orientation <= 8 else 1, film or None, ratio or None)
 
@@ -105,17 +99,9 @@ class OpenPhoto(NamedTuple):
 
     @property
     def is_panorama(self) -> bool:
-        """Whether it has the shape 2:1 and shows all around: its metadata say so, or its two ends fit together."""
+        """Whether it has the shape 2:1, and its metadata say that it shows all around."""
         width, height = self.size
-        if abs(width - 2 * height) > 2:
-            return False
-        if _PANORAMA in self.image.load():
-            return True
-        pixels = self.image.read()
-        pixels = pixels[..., :3] * pixels[..., 3:] if pixels.shape[2] == 4 else pixels
-        neighbours = np.abs(np.diff(pixels, axis=1)).mean((0, 2))
-        seam = np.abs(pixels[:, 0] - pixels[:, -1]).mean()
-        return bool(seam <= _SEAM * np.median(neighbours) + 1 / 255)
+        return abs(width - 2 * height) <= 2 and _PANORAMA in self.image.load()
 
     @property
     def focal_ratio(self) -> float | None:
@@ -174,27 +160,18 @@ class Photo:
         return np.asarray(cv2.cvtColor(np.ascontiguousarray(self.opaque()), cv2.COLOR_RGB2GRAY), np.uint8)
 
 
-def open_photos(paths: list[Path], masks: Path | None = None) -> list[OpenPhoto]:
-    """Open photos and read their bytes, which `read_photos` decodes.
-
-    `masks` is a folder with masks of photos; None: `masks/` beside the photos, if there is one.
-
-    Raises:
-        DataError: a file cannot be read or is not a photo, or masks are refused.
-    """
-    found = as_masks(find_mask_files(paths, paths[0].parent, masks)) if paths else {}
-    return [_open(path, found.get(path)) for path in paths]
-
-
-def _open(path: Path, mask: Mask | None) -> OpenPhoto:
-    image = ImageFile(path)
-    data = image.load()
-    if data[4:8] == b"ftyp" and not (image_file.is_heic(data) and folders.has_heic()):
-        raise DataError(path, "", "a photo", "a HEIC photo or a video under another name", advice=CONVERT)
-    exif = Exif.of(image.metadata.tags)
-    width, height = image.size
-    size = (height, width) if exif.is_sideways else (width, height)
-    return OpenPhoto(path, hashlib.sha256(data).hexdigest(), exif, size, image, mask)
+def open_photos(paths: Sequence[Path], masks: MaskFiles) -> list[OpenPhoto]:
+    """Open photos and read their bytes, which `read_photos` decodes; DataError of a file that is not a photo."""
+    opened = []
+    for path in paths:
+        image = ImageFile(path)
+        data = image.load()
+        if data[4:8] == b"ftyp" and not (image_file.is_heic(data) and folders.has_heic()):
+            raise DataError(path, "", "a photo", "a HEIC photo or a video under another name", advice=CONVERT)
+        exif = Exif.of(image.metadata.tags)
+        size = image.size[::-1] if exif.is_sideways else image.size
+        opened.append(OpenPhoto(path, hashlib.sha256(data).hexdigest(), exif, size, image, masks.of(path)))
+    return opened
 
 
 def read_photos(opened: list[OpenPhoto], bar: ProgressBar) -> list[Photo]:
@@ -261,10 +238,7 @@ def _cut(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
 def _reduced(image: Image, size: tuple[int, int], kept: Image | None) -> NDArray[np.uint8]:
     """An image of 8 bits with this width and height, of the visible colours of the given one alone.
 
-    Args:
-        image: RGB or RGBA, not premultiplied, in [0, 1].
-        size: width and height.
-        kept: the share of each pixel that a mask keeps, `(H, W)`; None: all of it.
+    It is RGB or RGBA, not premultiplied, in [0, 1]; `kept` is the share of each pixel that a mask keeps, `(H, W)`.
     """
     if image.shape[2] == 3:
         return _eight_bits(reduce(image, *size, kept))
@@ -289,10 +263,10 @@ def _kept(photo: OpenPhoto) -> Image | None:
     """
     if photo.mask is None:
         return None
-    photo.mask.file.load()
-    is_upright = Intrinsics(*photo.size, 1, 1, 0, 0).same_aspect(*photo.mask.file.size)
+    photo.mask.load()
+    is_upright = Intrinsics(*photo.size, 1, 1, 0, 0).same_aspect(*photo.mask.size)
     orientation = photo.exif.orientation if photo.exif.is_sideways and not is_upright else 1
-    kept = photo.mask.read(photo.path, *(photo.size[::-1] if orientation > 1 else photo.size))
+    kept = photo.mask.kept(photo.path, *(photo.size[::-1] if orientation > 1 else photo.size))
     return np.ascontiguousarray(turn(kept, orientation))
 
 

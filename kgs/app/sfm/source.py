@@ -7,7 +7,7 @@ from typing import Self
 from kgs.datasets.folders import CAMERAS_REPORT, layout_of, no_scene, scene_nearby
 from kgs.datasets.source import SceneSource
 
-from .find import find_photos, find_video, notes_on
+from .find import find_photos, find_video
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,3 @@ class Source:
         """Whether kgs finds the cameras, or found them: such a scene is fitted as the photos alone would be."""
         found = self.scene is not None and self.scene.layout == "COLMAP"
         return self.scene is None or (found and (self.path / CAMERAS_REPORT).is_file())
-
-    def notes(self, masks: Path | None) -> list[str]:
-        """What is to be said about unposed photos; `masks` is a folder of masks that is named."""
-        return notes_on(self.path, self.photos, masks) if self.photos else []

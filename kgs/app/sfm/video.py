@@ -27,8 +27,7 @@ from kgs.app.files.encoders import NOT_UTF8, for_opencv
 from kgs.app.files.outputs import write_png
 
 from .find import MAX_FRAMES, MIN_PHOTOS
-from .match import DEFAULT_FOCAL
-from .read import sharpness
+from .read import DEFAULT_FOCAL, sharpness
 
 FRAMES = 12
 MIN_DEGREES = 3.0  # between neighbours
@@ -55,18 +54,10 @@ class _Frame(NamedTuple):
 def take_frames(
     video: Path, folder: Path, count: int | None, bar: ProgressBar, say: Callable[[str], None]
 ) -> list[Path]:
-    """Write frames of a video to a folder, upright as its header says, as PNGs in the order of time.
+    """Write frames of a video to an empty folder, upright as its header says, as PNGs in the order of time.
 
-    Args:
-        video: a file that OpenCV reads.
-        folder: an empty folder.
-        count: the number of frames; None: twelve, fewer where neighbours would be less than 3 degrees apart, and up to
-            36 where they would be more than 10 apart.
-        bar: wraps the loops to show their progress, see :mod:`kgs._support.progress`.
-        say: called with a line about the frames.
-
-    Raises:
-        DataError: the file is not a video that can be read; PhotosRefused: the camera moves too little in it.
+    Unless a `count` is given: twelve, fewer where neighbours would be less than 3 degrees apart, and up to 36 where
+    they would be more than 10 apart. A DataError about what is no video, PhotosRefused where the camera hardly moves.
     """
     frames = _look(video, bar)
     way = frames[-1].way

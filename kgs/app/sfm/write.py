@@ -3,7 +3,6 @@
 import errno
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,6 +12,7 @@ from kgs._support.errors import DataError
 from kgs.app.files.outputs import write_png
 from kgs.datasets.layouts.colmap_model import read_cameras, read_images, read_points
 
+from .colmap import pycolmap
 from .map import Cameras, cameras_of
 from .pycolmap_processes import check_space
 from .read import Photo
@@ -41,17 +41,9 @@ def write_masks(folder: Path, photos: list[Photo], names: list[str]) -> None:
 
 
 def upright(cameras: Cameras, turned: set[str], names: Mapping[str, str]) -> Cameras:
-    """The cameras with those of photos that were turned clockwise turned back: other lenses for these.
-
-    Args:
-        cameras: of photos of one size.
-        turned: the names of photos that were turned.
-        names: the names of all photos by those of their images.
-    """
+    """The cameras with those of photos that were turned clockwise turned back: other lenses for these."""
     if turned.isdisjoint(cameras.rotations):
         return cameras
-    import pycolmap
-
     scene = cameras.reconstruction
     found = pycolmap.Reconstruction()
     count = max(scene.cameras)
@@ -89,15 +81,17 @@ def level_and_scale(cameras: Cameras) -> None:
         OpenCV's axes: afterwards y points down and, for the first photo, z forward as far as that is level. The origin
         is the mean of the cameras' centres.
     """
-    import pycolmap
-
     scene = cameras.reconstruction
     names = list(cameras.rotations)
     first = cameras.rotations[names[0]]
     up = -sum(rotation[1] for rotation in cameras.rotations.values())
     turned = leveling(first @ up) @ first
-    depths = np.concatenate([_depths(scene, image) for image in scene.images.values()])
-    scale = 1.0 / float(np.median(depths))
+    depths = list[NDArray[np.float64]]()  # of the points that each photo sees
+    for image in scene.images.values():
+        pose = image.cam_from_world().matrix()
+        points = [scene.points3D[point.point3D_id].xyz for point in image.points2D if point.has_point3D()]
+        depths.append(np.array(points).reshape(-1, 3) @ pose[2, :3] + pose[2, 3])
+    scale = 1.0 / float(np.median(np.concatenate(depths)))
     center = np.mean([cameras.centers[name] for name in names], axis=0)
     scene.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(turned), -scale * turned @ center))
 
@@ -117,13 +111,6 @@ def write_model(folder: Path, cameras: Cameras, images: Path) -> None:
     except DataError as error:
         check_space(folder)
         raise OSError(errno.EIO, "COLMAP's model was not written whole", str(folder)) from error
-
-
-def _depths(scene: Any, image: Any) -> NDArray[np.float64]:
-    """Depths of the points that a photo sees."""
-    pose = image.cam_from_world().matrix()
-    points = [scene.points3D[point.point3D_id].xyz for point in image.points2D if point.has_point3D()]
-    return np.asarray(np.array(points).reshape(-1, 3) @ pose[2, :3] + pose[2, 3])
 
 
 def leveling(up: NDArray[np.float64]) -> NDArray[np.float64]:

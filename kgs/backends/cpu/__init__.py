@@ -34,6 +34,7 @@ NUMBA = Backend(
     package=("numba", f"run {installing('fast')}"),
     tile_size=8,  # a constant of the kernels
     max_width=2**18 - 8,  # columns of tiles, and how many, are numbers of 15 bits
+    has_torch_on_one_thread=True,
     max_absgrad_features=8,  # a block: sums of absolute values of several would be added up
     project=Lazy("kgs.backends.cpu.projection:project"),
     compositor=Lazy("kgs.backends.cpu.compositing:CpuCompositor"),

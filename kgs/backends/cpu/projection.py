@@ -39,7 +39,7 @@ def project(
     views = _views(cameras, options.frame or whole_frame(size))
     inputs = (*vars(gaussians).values(), cameras.extrinsics, cameras.intrinsics)
     fields = _Projection.apply(*inputs, views, frustum, harmonics)
-    means2d, factors, depths, alphas, rgb, ids, camera_ids, radii, num_nonfinite = fields
+    means2d, factors, depths, opacities, rgb, ids, camera_ids, radii, num_nonfinite = fields
     if colors and not harmonics:
         rgb = gaussians.colors.index_select(0, ids)
     return ProjectedGaussians(
@@ -49,7 +49,7 @@ def project(
         factors,
         depths,
         radii,
-        alphas,
+        opacities,
         rgb,
         image_size=size,
         num_cameras=len(cameras.extrinsics),
@@ -76,11 +76,11 @@ class _Projection(torch.autograd.Function):
             visible = _close_up(out, counts[:, 0])
             parts.append([x[:visible] for x in lists])
         joined = [x[0] if len(parts) == 1 else torch.cat(x) for x in zip(*parts, strict=True)]
-        means2d, factors, depths, alphas, rgb, radii, ids = joined
+        means2d, factors, depths, opacities, rgb, radii, ids = joined
         factors = factors.view(-1, 2, 3)
         num_nonfinite = ids.new_tensor(int(counts[:, 1].sum()))
         camera_ids = torch.from_numpy(np.repeat(np.arange(len(parts)), [len(part[-1]) for part in parts]))
-        return means2d, factors, depths, alphas, rgb, ids, camera_ids, radii, num_nonfinite
+        return means2d, factors, depths, opacities, rgb, ids, camera_ids, radii, num_nonfinite
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:

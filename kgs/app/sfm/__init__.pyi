@@ -1,0 +1,1 @@
+from .pose import pose_photos as pose_photos

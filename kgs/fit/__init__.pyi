@@ -1,0 +1,12 @@
+from .config import FitConfig as FitConfig
+from .fit import Fit as Fit
+from .measures import measure as measure
+from .plan import Plan as Plan
+from .plan import make_plan as make_plan
+from .pruning import prune as prune
+from .run import Hooks as Hooks
+from .run import InitialPoints as InitialPoints
+from .run import choose_points as choose_points
+from .run import fit_scene as fit_scene
+from .run import initial_points as initial_points
+from .trainer import Trainer as Trainer
