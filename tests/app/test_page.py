@@ -196,6 +196,8 @@ def test_measures_have_their_spread(tmp_path: Path) -> None:
         ({"": {"test": None, "held_out": views(27.0), "train": views(33.0)}}, "27.0 dB, that is close to the photos"),
         ({"": {"test": views(4.9)}}, "4.9 dB, that is not the scene of the photos."),
         ({"": {"views": views(27.0)}}, "PSNR on 1 photo: 27.0 dB."),
+        ({"": {"test": views(23.7), "color_corrected": views(34.45)}}, ": 34.5 dB, that is hard to tell from the"),
+        ({"": {"test": views(23.7), "color_corrected": views(34.45)}}, "differ in brightness"),
         ({"": {"test": {"psnr": None, "views": [{"name": "a", "psnr": None}]}}}, "not measured."),
     ],
 )

@@ -27,7 +27,7 @@ MIN_PHOTOS = 3
 MAX_FRAMES = 36  # of a video, where twelve would be too far apart
 _LISTED = 10
 CONVERT = (
-    'kgs reads PNG, JPEG, WebP, TIFF and BMP, and HEIC with its extra (pip install -e ".[heic]"). Or make JPEGs: on a '
+    'kgs reads PNG, JPEG, WebP, TIFF and BMP, and HEIC with its extra (pip install ".[heic]"). Or make JPEGs: on a '
     "Mac `sips -s format jpeg *.HEIC --out jpeg`, elsewhere `magick mogrify -format jpg *.HEIC` (ImageMagick) or "
     "`heif-convert` (libheif); on an iPhone Settings > Camera > Formats > Most Compatible takes JPEGs from the start"
 )
