@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from command import run
 from compressed_reader import decode, header
 from factories import random_model, random_views
 from kornia.geometry.camera import PinholeCamera
@@ -184,3 +185,23 @@ def test_the_still_is_the_middle_of_a_photo(tmp_path: Path, size: tuple[int, int
     x, y = views.camera(index).project(torch.tensor([[[0.3, -0.2, 4.0]]]))[0, 0].tolist()
     expected = (x - (width - 1) / 2) * scale + 1199 / 2, (y - (height - 1) / 2) * scale + 629 / 2
     assert camera.project(torch.tensor([[[0.3, -0.2, 4.0]]]))[0, 0].tolist() == pytest.approx(expected, abs=1e-2)
+
+
+def test_kgs_export_says_how_many_bytes_are_left(tmp_path: Path, capsys: Any) -> None:
+    splat = tmp_path / "splat.ply"
+    kgs.save_ply(splat, random_model(300, 1))
+    out = tmp_path / "small.compressed.ply"
+    for _ in range(2):  # its own file may be replaced
+        assert run("export", splat, "-o", out) == 0
+    said = capsys.readouterr().out
+    assert f"{out}: 300 Gaussians, 0.01 MB of 0.03" in said
+    kgs.save_compressed_ply(tmp_path / "same.ply", kgs.load_ply(splat))
+    assert out.read_bytes() == (tmp_path / "same.ply").read_bytes()
+
+
+def test_an_origin_of_kgs_export_makes_map_coordinates_small(tmp_path: Path) -> None:
+    model = random_model(20, 0)
+    kgs.save_ply(tmp_path / "map.ply", model, torch.tensor([5e6, 6e6, 100.0]).double())
+    out = tmp_path / "map.compressed.ply"
+    assert run("export", tmp_path / "map.ply", "-o", out, "--origin", 5000000, 6000000, 100) == 0
+    np.testing.assert_allclose(decode(out)["means"], model.means.detach().numpy(), atol=0.01)

@@ -206,25 +206,6 @@ def test_eval_does_not_pass_off_the_checkpoint_of_another_step(scene: Any, done:
         load_fit(done)
 
 
-def test_eval_and_a_fit_keep_out_of_each_others_way(scene: Any, done: Path, monkeypatch: Any) -> None:
-    """A second one is refused before it measures, and no fit takes the place of the one that is being measured."""
-    plain = measures.measure_again
-    refused = 0
-
-    def meanwhile(*arguments: Any) -> Any:
-        nonlocal refused
-        for again in (lambda: fit(scene, OTHER, done), lambda: evaluate(done)):
-            with pytest.raises(DataError, match="at work"):
-                again()
-            refused += 1
-        return plain(*arguments)
-
-    monkeypatch.setattr(measures, "measure_again", meanwhile)
-    evaluate(done)
-    assert refused == 2
-    assert seed_of(done) == 0
-
-
 def test_eval_says_how_to_go_on_with_a_fit_that_was_killed(tmp_path: Path) -> None:
     (tmp_path / UNFINISHED).mkdir()
     (tmp_path / UNFINISHED / CHECKPOINT).touch()

@@ -72,7 +72,7 @@ def splats(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         ("clean {file} -o {here}/a.ply", "got one without 'ply' in the first line"),
         ("clean {splat} -o {splat}", "--out: expected another file"),
         ("export {splat} -o {out}.sog", "--out: "),
-        ("export {splat} -o {folder}", "folder.ply: "),
+        ("export {splat} -o {folder}", "folder.ply: expected a file"),
         ("export {empty} -o {here}/a.ply", "empty.ply: vertex: "),
         ("export {folder} -o {here}/a.ply", "folder.ply/config.json"),
         ("page {splat} -o {here}/a.html", "--cameras: expected the scene of the PLY file"),

@@ -188,13 +188,6 @@ def test_tries_are_few_and_change_nothing_where_they_find_no_more():
     assert retry(Tries(), NAMES, (), NO_CAMERAS, NO_CAMERAS, set(ALL)) is NO_CAMERAS
 
 
-def test_what_a_solver_sees_itself_decides_where_the_two_differ():
-    richer = cameras(points=91)
-    tries = Tries(cameras(), richer, cameras(points=89))
-    assert retry(tries, NAMES, (), cameras(), cameras(), set("c")) is richer
-    assert [call for call in tries.calls if "first_pair" in call] == tries.calls[:4]
-
-
 def test_a_photo_is_registered_by_own_points_beside_the_cameras_of_the_others():
     other, whole = cameras(), cameras(points=70)
     tries = Tries(*[NO_CAMERAS] * 4, whole)

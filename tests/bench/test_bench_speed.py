@@ -4,7 +4,6 @@ import csv
 import subprocess
 import time
 
-import numpy as np
 import pytest
 import torch
 from kornia.geometry.camera import PinholeCamera
@@ -12,7 +11,7 @@ from kornia.geometry.camera import PinholeCamera
 import kgs
 from kgs.bench import speed
 from kgs.bench.scenes import layered_scene
-from kgs.bench.speed import Cases, _exponent
+from kgs.bench.speed import Cases
 from kgs.bench.timing import busy_processes, take_turns, time_parts
 
 
@@ -66,30 +65,6 @@ def test_stages_are_those_of_a_whole_step():
             break
     for name, parameter in cases.model.named_parameters():
         torch.testing.assert_close(parameter.grad, expected[name], rtol=1e-4, atol=1e-5 * expected[name].abs().max())
-
-
-def test_savings_leave_the_image_alone():
-    cases = Cases(300, (40, 56), torch.device("cpu"))
-    seen = []
-    whole, renderer = cases.forward(), cases.renderer
-
-    def recorder(gaussians, camera, **options):
-        seen.append(gaussians)
-        return renderer(gaussians, camera, **options)
-
-    recorder.backend = renderer.backend
-    cases.renderer = recorder
-    savings = cases.savings()
-    for name in ("colours frozen", "geometry frozen"):
-        savings[name]()
-        image = renderer(seen[-1], cases.camera).image
-        assert torch.equal(image, whole)
-    savings["half of the Gaussians behind the camera"]()
-    assert len(kgs.project(seen[-1], cases.camera)) < 0.6 * len(kgs.project(cases.model(), cases.camera))
-
-
-def test_the_exponent_of_a_power_law():
-    assert _exponent(np.array([(x, 3 * x**1.5) for x in (1.0, 2.0, 8.0)])) == pytest.approx(1.5)
 
 
 @pytest.mark.slow
