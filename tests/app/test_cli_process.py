@@ -124,8 +124,8 @@ MISTAKES = [  # words, what is said of them, and a package that is not installed
     ("render taken/splat.ply --cameras empty -o out", "empty: expected a scene", ""),
     ("eval empty", "empty/config.json: expected", ""),
     ("page taken/splat.ply --cameras poses -o out", "--out: expected a file that ends in .html", ""),
-    ("study -o out", 'pandas is missing: run pip install -e ".[study]"', "pandas"),
-    ("study -o out", 'matplotlib is missing: run pip install -e ".[app]"', "matplotlib"),
+    ("study -o out", 'pandas is missing: run pip install ".[study]"', "pandas"),
+    ("study -o out", 'matplotlib is missing: run pip install ".[app]"', "matplotlib"),
     ("study -o out --lpips-weights missing", "missing: expected a file or folder, got none", ""),
 ]
 RUN_ALL = """

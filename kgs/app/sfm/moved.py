@@ -3,7 +3,7 @@
 A thing that lies elsewhere in the later photos, as a book or a chessboard, matches as well as before. Solvers place
 all photos around it, agree, and are wrong about the rest: the groups show different surroundings in one place. The
 parts of one scene share more than that: in sets of photos that are right, the points that join two groups are seen in
-0.63 and more of some photo; of two desks with one chessboard in 0.24 (docs/results/cameras).
+0.4 and more of some photo; of two desks with one chessboard in 0.24 (docs/results/cameras).
 """
 
 from itertools import combinations

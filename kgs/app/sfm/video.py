@@ -86,8 +86,8 @@ def _look(video: Path, bar: ProgressBar) -> list[_Frame]:
     frames = list[_Frame]()
     with _Reader(video) as reader:
         motion = _Motion()
-        every = max(1, reader.count // _LOOKED_AT)
-        for index in bar(range(0, reader.count, every), "video", "frame"):
+        count = reader.count()
+        for index in bar(range(0, count, max(1, count // _LOOKED_AT)), "video", "frame"):
             pixels = reader.read(index)
             if pixels is None:
                 break
@@ -161,13 +161,9 @@ class _Reader:
         if path is None:
             raise DataError(video, "", "a video that OpenCV can open", advice=f"{NOT_UTF8}")
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # else FFmpeg writes of damage to stderr
-        self._capture = cv2.VideoCapture(str(path))
+        self._path = str(path)
+        self._capture = cv2.VideoCapture(self._path)
         self._next = 0
-        self.count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        if self.count <= 0:  # the header of a recorder that writes as it goes has none
-            self.count = sum(1 for _ in iter(self._capture.grab, False))
-            self._capture.release()
-            self._capture = cv2.VideoCapture(str(path))
         self._pixel_width = self._aspect()  # over its height
 
     def _aspect(self) -> float:
@@ -183,6 +179,14 @@ class _Reader:
 
     def __exit__(self, *_: object) -> None:
         self._capture.release()
+
+    def count(self) -> int:
+        """The number of frames that are decoded: headers guess it from a rate and a duration. Begins again."""
+        count = sum(1 for _ in iter(self._capture.grab, False))
+        self._capture.release()
+        self._capture = cv2.VideoCapture(self._path)
+        self._next = 0
+        return count
 
     def read(self, index: int) -> NDArray[np.uint8] | None:
         """A frame, `(H, W, 3)` BGR, behind the last one that was read, or None behind the end.
