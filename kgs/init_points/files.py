@@ -48,6 +48,9 @@ def read_points(path: Path, origin: Tensor | None = None) -> tuple[Tensor, Tenso
         if head.startswith(magic):
             raise DataError(path, "", "a point cloud or mesh", f"a {name} archive", advice="unpack it first")
     points, colors = _read_splat(path, origin) if is_splat else _read_cloud(path, is_ply and is_text, origin)
+    said = re.search(rb"^element +vertex +(\d+)", head, re.MULTILINE) if is_ply else None
+    if said and int(said[1]) != len(points) and not is_splat:
+        raise DataError(path, "vertices", f"{int(said[1])} as its header says", len(points))
     is_finite = points.isfinite().all(dim=1)
     count = int(is_finite.sum())
     if not count:
@@ -89,6 +92,10 @@ def _read_cloud(path: Path, is_ascii_ply: bool, origin: Tensor | None) -> tuple[
     if origin is not None:
         points = points - origin
     points = points.float()
+    grey = torch.full((len(points), 3), 0.5, dtype=torch.float32)
     if colors.ndim != 2 or len(colors) != len(points) or colors.shape[1] < 3:  # no colours, or not one for each point
-        return points, torch.full((len(points), 3), 0.5, dtype=torch.float32)
-    return points, colors[:, :3].float() / 255.0
+        return points, grey
+    rgb = colors[:, :3]
+    if not bool(((rgb > 1) & (rgb < 255)).any()):  # normals, or shares of 1, of an XYZ file, which does not say which
+        return points, grey
+    return points, rgb.float() / 255.0

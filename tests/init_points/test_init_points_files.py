@@ -101,6 +101,23 @@ def test_points_that_are_not_finite_are_left_out_and_counted(tmp_path, bad):
     np.testing.assert_allclose(result.colors.numpy(), colors[::2, :3] / 255, atol=1e-6)
 
 
+def test_a_text_with_fewer_points_than_its_header_says_is_refused(tmp_path):
+    """One that was cut short; trimesh refuses such binary files."""
+    content = trimesh.PointCloud(np.ones((5, 3))).export(file_type="ply", encoding="ascii")
+    path = tmp_path / "cloud.ply"
+    path.write_bytes(content.replace(b"element vertex 5", b"element vertex 6"))
+    with refused(DataError, path=path, key="vertices", got="5"):
+        initial_points(flat(), "file", file=path)
+
+
+@pytest.mark.parametrize("columns", ["0 0.6 -0.8", "-1 0 0", "1 0.25 0.5"], ids=["normal", "along an axis", "shares"])
+def test_what_follows_the_positions_of_a_text_may_be_no_colours(tmp_path, columns):
+    """MeshLab writes normals there, Open3D shares of 1: as colours up to 255 they are black."""
+    (tmp_path / "cloud.xyz").write_text("".join(f"0 0 {z} {columns}\n" for z in range(4)))
+    result = initial_points(flat(), "file", file=tmp_path / "cloud.xyz")
+    assert torch.equal(result.colors, torch.full((4, 3), 0.5))
+
+
 def test_a_file_without_a_finite_point_is_refused(tmp_path):
     """Colours of no points are no table, which was an IndexError."""
     trimesh.PointCloud(np.full((2, 3), np.nan)).export(tmp_path / "cloud.ply")
