@@ -62,7 +62,7 @@ def test_metrics_have_the_agreed_keys_and_say_what_the_splat_and_config_do(fitte
     metrics = json.loads((fitted / "metrics.json").read_text())
     assert set(metrics) == {
         "test", "train", "curve", "seconds", "peak_rss_mb", "gaussians", "decisions", "steps", "seed", "drop", "init",
-        "backend", "protocol", "versions", "seen", "poses",
+        "backend", "protocol", "versions", "seen", "poses", "outlines",
     }  # fmt: skip
     assert set(metrics["test"]) == {"psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled", "views"}
     assert metrics["test"]["lpips_vgg"] is None

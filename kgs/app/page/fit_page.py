@@ -24,6 +24,7 @@ from kgs.fit.fit import Fit
 from kgs.fit.measures import used_init
 from kgs.fit.pruning import contributions, left_out
 from kgs.geometry.cameras import joined
+from kgs.metrics.outlines import doubt
 
 from .content import PageContent, PagePhotos, PageSplat, PageText
 from .figures import psnr_of_views
@@ -98,7 +99,7 @@ def write_fit_page(
         text=PageText(
             title,
             runs=runs,
-            notes=notes,
+            notes=[*filter(None, (doubt(run.get("outlines") or {}) for run in runs.values())), *notes],
             remarks=[*(line for run in runs for line in _remarks(run, runs[run])), *remarks],
             settings=_settings(settings or {}, fit.metrics),
             report=_report_facts(found),

@@ -3,10 +3,10 @@
 A low reprojection error proves nothing: a few matches fit wrong cameras as well. So two solvers, which use other
 keypoints, each find the cameras. *Consensus*: both register a photo, and agree about its rotation and its lens.
 *Retry*: before a photo is rejected, the solvers that failed about it try again. *Rejected photos*: those that show
-another place, or the same as another photo from the same place, and those without consensus or with few points; at
-least three remain. *Acceptance checks*: of the others the focal length has to be in the range of real lenses, and
-determined by the photos or their Exif; each photo has to see many points; and the solvers have to agree. Else all
-photos are refused, and the user is told what to photograph next.
+another place, or the same as another photo from the same place, those without consensus or with few points, and the
+smaller of two groups between which something was moved; at least three remain. *Acceptance checks*: of the others the
+focal length has to be in the range of real lenses, and determined by the photos or their Exif; each photo has to see
+many points; and the solvers have to agree. Else all photos are refused, and the user is told what to photograph next.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
@@ -25,6 +25,7 @@ from kgs.geometry.rigs import degrees_between
 from .find import MIN_PHOTOS
 from .map import Cameras, Solver
 from .match import colmap_matching, lenses_of, write_matches
+from .moved import moved_photos
 from .pairs import (
     FEWER,
     MIN_MATCHES,
@@ -110,7 +111,7 @@ def accepted_cameras(
         known = [lens.focal_length for lens in lenses] if are_known else []
         consensus = Consensus((first, second), second_matches, executor, known, pairs)
         solutions, held = consensus.solve(kept)
-        while more := without_cameras(solutions, list(kept.values()), pairs):
+        while more := without_cameras(solutions, list(kept.values()), pairs) or moved_between(solutions, kept):
             rejected |= more
             kept = {image: name for image, name in kept.items() if name not in rejected}
             solutions, held = consensus.solve(kept)
@@ -232,6 +233,21 @@ def without_cameras(solutions: Solutions, names: Sequence[str], pairs: Pairs) ->
     # without photos that were registered badly the solvers may agree about the others
     left = _registered_badly(*solutions, names, pairs) or _disputed(*solutions, names)
     return left if len(names) - len(left) >= MIN_PHOTOS else {}
+
+
+def moved_between(solutions: Solutions, names: Mapping[str, str]) -> dict[str, str]:
+    """Photos that one flat thing alone joins to a larger group of at least `MIN_PHOTOS`, and why they are left out.
+
+    Args:
+        solutions: what the two solvers found.
+        names: those of the photos, by those of their images.
+    """
+    found = [moved_photos(cameras.reconstruction) for cameras in solutions if cameras.points]
+    images = next(filter(None, found), [])
+    if len(names) - len(images) < MIN_PHOTOS:
+        return {}
+    why = "only one flat thing joins it to the other group of photos: was that moved, or is this another place?"
+    return {names[image]: why for image in images}
 
 
 def doubtful(solutions: Solutions, names: Sequence[str], pairs: Pairs) -> set[str]:

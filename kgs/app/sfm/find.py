@@ -27,7 +27,7 @@ MIN_PHOTOS = 3
 MAX_FRAMES = 36  # of a video, where twelve would be too far apart
 _LISTED = 10
 CONVERT = (
-    'kgs reads PNG, JPEG, WebP, TIFF and BMP, and HEIC with its extra: pip install -e ".[heic]"\n'
+    'kgs reads PNG, JPEG, WebP, TIFF and BMP, and HEIC with its extra: pip install ".[heic]"\n'
     "Or make JPEGs: `sips -s format jpeg *.HEIC --out jpeg` on a Mac, else `magick mogrify -format jpg *.HEIC`\n"
     "An iPhone takes JPEGs from the start: Settings > Camera > Formats > Most Compatible"
 )
