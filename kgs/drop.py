@@ -55,7 +55,8 @@ class DropGaussian(nn.Module):
 
     The rate of a call is `p * schedule(progress)`. The training loop sets `progress`, in [0, 1]; a layer whose progress
     is never set is plain dropout at p. The first call in `train()` warns about that, and about opacities outside
-    [0, 1], which are probably logits. The `state_dict` is empty. `torch.compile` runs the layer outside its graphs.
+    [0, 1], which are probably logits. The `state_dict` is empty. `torch.compile` runs the layer outside its
+    graphs, so `fullgraph=True` raises in `train()`.
 
     Args:
         p: as in :func:`drop_gaussian`, at the end of the schedule. The attribute may be set anew.
