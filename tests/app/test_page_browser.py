@@ -677,6 +677,8 @@ def test_two_clicked_points_have_a_distance(opened: Browser) -> None:
     assert said.split()[0] == f"{distance:.2g}"
     words = opened.run("document.querySelector('.measured code').textContent").split()
     assert words[:4] == ["kgs", "scale", "OUT", "--by"]
+    unbroken = "getComputedStyle(document.querySelector('.measured .option')).whiteSpace"
+    assert opened.run(unbroken) == "nowrap"
     shown = [np.array([float(value) for value in word.split(",")]) for word in words[4:6]]
     for one, expected in zip(shown, points, strict=True):
         np.testing.assert_allclose(one, expected + np.array([1000, 0, -3]), atol=5e-3 * distance)

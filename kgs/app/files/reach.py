@@ -53,7 +53,8 @@ def _within_reach(fit: Fit, cameras: PinholeCamera) -> tuple[Tensor, int]:
     best = int(np.argmax(shares))
     least = _LEAST * shares[best]
     halfway = np.linspace(0, 0.5, _STEPS + 1)  # of the path there and back
-    for i in np.flatnonzero(np.array(shares) < least):
-        way = camera_path(small.extrinsics[[i, best]], halfway, depth=1.0).to(poses)
-        poses[i] = next((pose for pose in way[:-1] if share(i, pose) >= least), way[-1])
+    for i, shown in enumerate(shares):
+        if shown < least:
+            way = camera_path(small.extrinsics[[i, best]], halfway, depth=1.0).to(poses)
+            poses[i] = next((pose for pose in way[:-1] if share(i, pose) >= least), way[-1])
     return poses.to(cameras.extrinsics), best
