@@ -27,9 +27,9 @@ MIN_PHOTOS = 3
 MAX_FRAMES = 36  # of a video, where twelve would be too far apart
 _LISTED = 10
 CONVERT = (
-    'kgs reads PNG, JPEG, WebP, TIFF and BMP, and HEIC with its extra (pip install ".[heic]"). Or make JPEGs: on a '
-    "Mac `sips -s format jpeg *.HEIC --out jpeg`, elsewhere `magick mogrify -format jpg *.HEIC` (ImageMagick) or "
-    "`heif-convert` (libheif); on an iPhone Settings > Camera > Formats > Most Compatible takes JPEGs from the start"
+    'kgs reads PNG, JPEG, WebP, TIFF and BMP, and HEIC with its extra: pip install ".[heic]"\n'
+    "Or make JPEGs: `sips -s format jpeg *.HEIC --out jpeg` on a Mac, else `magick mogrify -format jpg *.HEIC`\n"
+    "An iPhone takes JPEGs from the start: Settings > Camera > Formats > Most Compatible"
 )
 ADVICE = "Take 3 to 12 photos of one scene that does not move, a small step between them, so that neighbours overlap"
 
