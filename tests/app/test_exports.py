@@ -168,21 +168,23 @@ def test_the_film_leaves_out_what_is_right_before_its_camera(fit: Fit, tmp_path:
 
 
 @pytest.mark.parametrize("size", [(30, 60), (60, 30)])
-def test_the_still_is_the_middle_of_a_photo(tmp_path: Path, size: tuple[int, int]) -> None:
+def test_the_still_is_the_middle_of_a_photo(fit: Fit, tmp_path: Path, monkeypatch: Any, size: tuple[int, int]) -> None:
     views = random_views(3, *size)
     seen = []
 
-    def draw(camera: PinholeCamera) -> torch.Tensor:
-        seen.append(camera)
+    def draw(enlarged: Fit, camera: PinholeCamera) -> torch.Tensor:
+        seen.append((enlarged.options.eps2d, camera))
         return torch.full((1, 3, int(camera.height), int(camera.width)), 0.5)
 
-    write_preview(tmp_path / "preview.jpg", draw, views)
+    monkeypatch.setattr(Fit, "render", draw)
+    write_preview(tmp_path / "preview.jpg", fit, views, 2)
     assert cv2.imread(str(tmp_path / "preview.jpg")).shape == (630, 1200, 3)
-    (camera,) = seen
-    index = [torch.equal(camera.extrinsics[0], pose) for pose in views.cameras.extrinsics].index(True)
+    ((eps2d, camera),) = seen
+    assert torch.equal(camera.extrinsics[0], views.cameras.extrinsics[2])
     height, width = size
     scale = max(1200 / width, 630 / height)
-    x, y = views.camera(index).project(torch.tensor([[[0.3, -0.2, 4.0]]]))[0, 0].tolist()
+    assert eps2d == pytest.approx(scale**2 * fit.options.eps2d)  # the image of the fit, enlarged
+    x, y = views.camera(2).project(torch.tensor([[[0.3, -0.2, 4.0]]]))[0, 0].tolist()
     expected = (x - (width - 1) / 2) * scale + 1199 / 2, (y - (height - 1) / 2) * scale + 629 / 2
     assert camera.project(torch.tensor([[[0.3, -0.2, 4.0]]]))[0, 0].tolist() == pytest.approx(expected, abs=1e-2)
 

@@ -52,8 +52,16 @@ class Ruler {
 
   show(text, command = "") {
     this.words.textContent = text;
-    if (command) this.words.append(document.createElement("br"), document.createElement("code"));
-    if (command) this.words.lastChild.textContent = command;
+    if (command) {
+      const code = document.createElement("code");
+      for (const part of command.split(/(--\w+)/)) {
+        const span = document.createElement("span");
+        span.textContent = part;
+        span.classList.toggle("option", part.startsWith("--"));  // no line ends inside it
+        code.append(span);
+      }
+      this.words.append(document.createElement("br"), code);
+    }
     this.draw();
   }
 

@@ -1,7 +1,7 @@
 "use strict";
 // The viewer: an eye that turns around a splat, moves, zooms, and flies to the cameras of the photos and along them, on
 // the path of the film: slowly until it is touched, and at the speed of the film where one plays it. It turns as far
-// around the splat as these cameras do, unless it may roam.
+// around the splat as the cameras of the film do, unless it may roam.
 // OpenCV axes: the rows of a rotation are the directions right, down and forward in the world.
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -15,7 +15,7 @@ const CLICK_PIXELS = 4;  // a pointer that moves farther than this drags
 const FLIGHT_MILLISECONDS = 700;
 const STEEPEST = 1.5;  // largest angle above or below the horizon, in radians
 const ROAMING_ARC = Math.PI;  // radians that a drag across the stage turns where the cameras set no limit
-const SOFT_END = 0.25;  // how far beyond the arc of the cameras the eye can turn, as a share of the arc
+const SOFT_END = 0.1;  // where the eye turns less and less, at either end of the arc, as a share of the arc
 const MIN_COVERAGE = 1 / 3;  // of the stage, by the splat: where the eye roams to
 const MIN_PART = 1 / 2;  // likewise, of what it covers from the photo's camera, where that is less
 const ROAMING_STEP = 0.1;  // radians: how finely this is tested
@@ -42,13 +42,11 @@ function rotated(vector, axis, angle) {
   return vector.map((value, i) => cosine * value + sine * side[i] + along * axis[i]);
 }
 
-// The part of a change of an angle that is left near the ends of an arc: beyond them less and less, down to nothing.
+// The part of a change of an angle that is left near the ends of an arc: less and less, down to nothing.
 function softened(change, angle, [low, high]) {
-  const soft = SOFT_END * (high - low);
-  const beyond = change > 0 ? angle - high : low - angle;
-  const share = clamped(1 - beyond / soft, 0, 1);
-  const [min, max] = [Math.min(angle, low - soft), Math.max(angle, high + soft)];
-  return clamped(angle + share * change, min, max) - angle;
+  const left = change > 0 ? high - angle : angle - low;
+  const share = clamped(left / (SOFT_END * (high - low)), 0, 1);
+  return clamped(angle + share * change, Math.min(angle, low), Math.max(angle, high)) - angle;
 }
 
 const wantsLessMotion = () => matchMedia("(prefers-reduced-motion: reduce)").matches;

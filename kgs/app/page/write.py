@@ -82,6 +82,7 @@ class _Page:
             content.photos.parts,
             content.splat.gaussians.means,
             psnr_of_views(runs[-1]) if runs else {},
+            content.photos.path,
         )
         offset = content.splat.offset
         self._scene = scene | {"offset": [0.0, 0.0, 0.0] if offset is None else offset.tolist()}
