@@ -17,7 +17,6 @@ from kgs.datasets.images import Intrinsics
 from .colmap_model import ColmapCamera, model_file, read_cameras, read_images, read_points
 from .colmap_poses import registered_images
 
-_LISTED = 20
 # With the names of the test views: 3DGS has the first one beside the model, nerfstudio the other in the scene's folder.
 _TEST_LISTS = ("test.txt", "test_list.txt")
 
@@ -52,7 +51,7 @@ def load(root: Path, photo_folder: str = "") -> FrameSet:
         ids[path] = image_id
     gone = [frame.name for frame in frames if not frame.path.is_file()]
     if 0 < len(gone) <= len(frames) / 2:
-        notes += (f"left out, because the file is gone: {len(gone)} of {len(frames)} photos ({listed(gone, _LISTED)})",)
+        notes += (f"left out, because the file is gone: {len(gone)} of {len(frames)} photos ({listed(gone)})",)
         frames = [frame for frame in frames if frame.path.is_file()]
     train, test, on_list = _split_by_list(root, folder, frames)
     notes += on_list
@@ -92,7 +91,7 @@ def largest_model(root: Path) -> tuple[Path, tuple[str, ...]]:
     largest = max(folders, key=counts.__getitem__)
     others = [f"{folder.relative_to(root)} has {counts[folder]}" for folder in folders if folder != largest]
     name = largest.relative_to(root)
-    note = f"{name} is the COLMAP model that is read, with {counts[largest]} images: {', '.join(others[:_LISTED])}"
+    note = f"{name} is the COLMAP model that is read, with {counts[largest]} images: {listed(others)}"
     return largest, (note,)
 
 

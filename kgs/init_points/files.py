@@ -48,8 +48,8 @@ def read_points(path: Path, origin: Tensor | None = None) -> tuple[Tensor, Tenso
         if head.startswith(magic):
             raise DataError(path, "", "a point cloud or mesh", f"a {name} archive", advice="unpack it first")
     points, colors = _read_splat(path, origin) if is_splat else _read_cloud(path, is_ply and is_text, origin)
-    said = re.search(rb"^element +vertex +(\d+)", head, re.MULTILINE) if is_ply else None
-    if said and int(said[1]) != len(points) and not is_splat:
+    said = re.search(rb"^element +vertex +(\d+)", head, re.MULTILINE)
+    if is_ply and said and not is_splat and int(said[1]) != len(points):
         raise DataError(path, "vertices", f"{int(said[1])} as its header says", len(points))
     is_finite = points.isfinite().all(dim=1)
     count = int(is_finite.sum())
@@ -92,10 +92,8 @@ def _read_cloud(path: Path, is_ascii_ply: bool, origin: Tensor | None) -> tuple[
     if origin is not None:
         points = points - origin
     points = points.float()
-    grey = torch.full((len(points), 3), 0.5, dtype=torch.float32)
-    if colors.ndim != 2 or len(colors) != len(points) or colors.shape[1] < 3:  # no colours, or not one for each point
-        return points, grey
-    rgb = colors[:, :3]
-    if not bool(((rgb > 1) & (rgb < 255)).any()):  # normals, or shares of 1, of an XYZ file, which does not say which
-        return points, grey
-    return points, rgb.float() / 255.0
+    has_one_each = colors.ndim == 2 and len(colors) == len(points) and colors.shape[1] >= 3
+    # An XYZ file does not say whether colours, normals or shares of 1 follow: of the latter two nothing is left.
+    if not has_one_each or not bool(((colors[:, :3] > 1) & (colors[:, :3] < 255)).any()):
+        return points, torch.full((len(points), 3), 0.5, dtype=torch.float32)
+    return points, colors[:, :3].float() / 255.0

@@ -73,8 +73,6 @@ def take_frames(
     with _Reader(video) as reader:
         for index in bar(indices, "frames", "frame"):
             pixels = reader.read(index)
-            if pixels is None:
-                raise DataError(video, "", f"frame {index} a second time", "none")
             paths.append(folder / f"frame_{index:05d}.png")
             write_png(paths[-1], torch.from_numpy(pixels[..., ::-1].copy()).permute(2, 0, 1))
     say(f"{video.name}: {len(paths)} frames, {way / (len(paths) - 1):.0f} degrees apart in the mean")
@@ -89,8 +87,6 @@ def _look(video: Path, bar: ProgressBar) -> list[_Frame]:
         count = reader.count()
         for index in bar(range(0, count, max(1, count // _LOOKED_AT)), "video", "frame"):
             pixels = reader.read(index)
-            if pixels is None:
-                break
             scale = min(1.0, _LONGEST / max(pixels.shape))
             full = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
             resized = cv2.resize(full, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -188,18 +184,14 @@ class _Reader:
         self._next = 0
         return count
 
-    def read(self, index: int) -> NDArray[np.uint8] | None:
-        """A frame, `(H, W, 3)` BGR, behind the last one that was read, or None behind the end.
-
-        It is never made smaller to have square pixels.
-        """
+    def read(self, index: int) -> NDArray[np.uint8]:
+        """A frame, `(H, W, 3)` BGR, behind the last one that was read; never made smaller to have square pixels."""
         while self._next <= index:
-            if not self._capture.grab():
-                return None
+            self._capture.grab()
             self._next += 1
         done, pixels = self._capture.retrieve()
         if not done:
-            return None
+            raise DataError(self._path, "", f"frame {index} again", "none")
         height, width = pixels.shape[:2]
         size = round(width * max(self._pixel_width, 1.0)), round(height / min(self._pixel_width, 1.0))
         if size == (width, height):
