@@ -157,7 +157,8 @@ def _tables(new: pd.DataFrame, old: pd.DataFrame, default: pd.DataFrame) -> tupl
     if not single:
         return tables, ["There is nothing stored to tell a change from noise by."]
     verdict = f"Beyond noise in the mean: {'; '.join(beyond)}." if beyond else "No mean has changed beyond noise."
-    return tables, [_answer(of_default), verdict, f"{count} of {len(single)} changes of single scenes are beyond noise."]
+    counted = f"{count} of {len(single)} changes of single scenes are beyond noise."
+    return tables, [_answer(of_default), verdict, counted]
 
 
 def _answer(means: Mapping[str, Change]) -> str:
