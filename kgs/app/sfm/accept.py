@@ -54,13 +54,13 @@ _MAX_TRIES = 4
 _REGISTRATIONS = 48  # of photos in all tries together, if that leaves as many tries: each registers all photos
 _UNTOLD = "the photos do not tell the focal length, and their Exif does not say it"
 _FORWARD = (
-    "The camera moved along its view, as when walking forward: what lies ahead hardly moves between such photos, and "
-    "nothing tells how far away it is. What helps most: step sideways, not forward, so that neighbours are 3 to 20 "
-    f"degrees apart.\n{FEWER}"
+    "The camera moved along its view: what lies ahead hardly moves between such photos, which hides its depth.\n"
+    f"What helps: step sideways, not forward, so that neighbours are 3 to 20 degrees apart.\n{FEWER}"
 )
 _APART = (
-    "As a rule they are too close together. What helps: larger steps to the side or up, so that neighbours are 3 to 20 "
-    "degrees apart; or the photos as the camera wrote them, since messengers and many editors drop Exif"
+    "As a rule they are too close together.\n"
+    "What helps: larger steps to the side or up, so that neighbours are 3 to 20 degrees apart.\n"
+    "Or the photos as the camera wrote them: messengers and many editors drop Exif"
 )
 
 Solutions = tuple[Cameras, Cameras]  # what the two solvers found
@@ -324,9 +324,9 @@ def check(
     registered = [name for name in names if name not in missing]
     between = gap(missing[0], registered, pairs) if missing and registered else weakest_link(names, pairs)
     beside = (
-        f"What helps most: photos from places between {' and '.join(between)}, with steps to the side or up (turning "
-        "on the spot shows no depth), so that neighbours share two thirds of the scene; a scene with texture; all with "
-        f"one lens, without zoom.\n{FEWER}"
+        f"What helps: photos from places between {' and '.join(between)}, with steps to the side or up.\n"
+        "Neighbours share two thirds of the scene, which has texture; all with one lens, without zoom.\n"
+        f"{FEWER}"
     )
     reasons = [objections(cameras, names, longest) for cameras in solutions]
     good = [i for i, objection in enumerate(reasons) if not objection]
