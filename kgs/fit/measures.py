@@ -65,7 +65,7 @@ def measure(fit: Fit, lpips: Lpips | None = None) -> dict[str, Any]:
         poses += ", those of the training views refined by the fit"
     everywhere = all(views.valid_mask is None for views in (scene.train, scene.test))
     pixels = "all pixels" if everywhere else "the pixels that count; SSIM and LPIPS take the others as equal"
-    is_long = fit.history["steps"] >= _MIN_STEPS
+    is_long = fit.history.get("steps", 0) >= _MIN_STEPS
     train = fit.train_renders
     test = fit.test_renders
     color_corrected = {}
