@@ -152,8 +152,8 @@ def unused_files(root: Path, layout: str | None = None) -> tuple[str, ...]:
         sentences.append("the COLMAP model is not used: expected its photos beside it or in images/")
     files = [path for path in sorted(root.iterdir()) if path.suffix.lower() in _MAY_HOLD_CAMERAS]
     if names := [path.name for path in files if path.name[0] != "." and path.is_file()]:
-        read = f"{', '.join(POSE_FILES)} and COLMAP models"
-        sentences.append(f"cameras in {listed(names)} would not be read: kgs reads those in {read}")
+        read = f"kgs reads {', '.join(POSE_FILES)} and COLMAP models: export one of these"
+        sentences.append(f"not read, though they may hold cameras: {listed(names)} ({read})")
     return tuple(sentences)
 
 

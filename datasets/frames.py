@@ -53,6 +53,8 @@ class Frame:
         if not (lens.fx >= SHORTEST_FOCAL * lens.width and lens.fy >= SHORTEST_FOCAL * lens.height):
             got = f"{lens.fx:g} and {lens.fy:g} for {lens.width}x{lens.height}"
             raise wrong("focal lengths in pixels, at least a tenth of the sides", got)
+        if not (0 < lens.cx < lens.width and 0 < lens.cy < lens.height):
+            raise wrong("a principal point in the image", f"{lens.cx:g}, {lens.cy:g} in {lens.width}x{lens.height}")
         if self.pose.shape != (4, 4) or not bool(torch.isfinite(self.pose).all()):
             raise wrong("a finite 4x4 pose")
         if max(lens.width, lens.height, *map(abs, numbers), float(center.abs().max())) > LARGEST:

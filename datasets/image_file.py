@@ -39,7 +39,6 @@ _PLUGINS: dict[bytes, type[Opened]] = {
     b"MM\0*": TiffImagePlugin.TiffImageFile,
 }
 _HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
-_LISTED = 10
 # Modes of Pillow that are supported, of 8 bits and fewer, and of 16.
 _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
 _MODES_OF_16 = ("I;16", "I;16B", "LA", "RGB", "RGBA")
@@ -135,8 +134,8 @@ def color_notes(images: Sequence[ImageFile]) -> list[str]:
         is_unnamed = not header.profile and header.tags.get(Base.ColorSpace) == _UNCALIBRATED
         if is_unnamed or not is_usable(header.profile):
             names.append(image.path.name)
-    said = "colours are taken for sRGB, since the colour profile is missing, damaged or of another kind"
-    return [f"{said}: {listed(names, _LISTED)}"] if names else []
+    said = "taken for sRGB, though their colour profile is missing or cannot be used"
+    return [f"{said}: {listed(names)}"] if names else []
 
 
 def read_bytes(path: Path) -> bytes:

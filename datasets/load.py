@@ -30,7 +30,6 @@ from .scene import Scene, Views
 from .source import SceneSource
 from .splits import TEST_EVERY, select_evenly, split_between_ends, split_by_name
 
-_LISTED = 20
 _BORDER = "the photos have a dark border, left by undistortion: it counts as part of the lens, not of the scene"
 # A camera whose picture is turned by a quarter clockwise: its x axis is up before, its y axis to the right.
 _CLOCKWISE = torch.tensor(
@@ -114,7 +113,7 @@ def load_scene(
         if not farthest <= LARGEST:
             raise DataError(root, "points", f"coordinates up to {LARGEST:g}", f"{farthest:g}")
         if missing := [frame.path for frame in (*train, *test) if not frame.path.is_file()]:
-            names = listed([path.relative_to(root) for path in missing], _LISTED)
+            names = listed([path.relative_to(root) for path in missing])
             count = len(train) + len(test)
             raise DataError(root, "", f"{count} images", count - len(missing), advice=f"there is no {names}")
         color = torch.tensor(BACKGROUNDS[background], dtype=torch.float32)
@@ -161,7 +160,7 @@ def _with_masks(root: Path, frame_set: FrameSet, folder: Path | None) -> FrameSe
         return frame_set
     photos = [frame.path for frames in parts for frame in frames]
     masks = find_masks(photos, root, folder)
-    notes = (*frame_set.notes, *masks.notes(root, _LISTED))
+    notes = (*frame_set.notes, *masks.notes(root))
     frames, test = ([replace(frame, mask=masks.of(frame.path)) for frame in frames] for frames in parts)
     return replace(frame_set, frames=frames, test=None if frame_set.test is None else test, notes=notes)
 

@@ -58,10 +58,10 @@ class MaskFiles(NamedTuple):
         """The mask of a photo, if it has one."""
         return Mask(self.masks[photo]) if photo in self.masks else None
 
-    def notes(self, root: Path, max_names: int) -> list[str]:
-        """A sentence each about files that fit no photo and others that are not used, up to `max_names` by name."""
+    def notes(self, root: Path) -> list[str]:
+        """A sentence each about files that fit no photo and others that are not used."""
         lost, unused = (
-            listed([path.relative_to(root) if path.is_relative_to(root) else path for path in paths], max_names)
+            listed([path.relative_to(root) if path.is_relative_to(root) else path for path in paths])
             for paths in (self.lost, self.unused)
         )
         notes = [f"masks that fit no photo of the scene: {len(self.lost)} ({lost})"] if self.lost else []

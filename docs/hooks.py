@@ -1,7 +1,7 @@
 """Makes pages of what lives outside docs/ (README, CHANGELOG, CONTRIBUTING, notebooks) and shows mkdocstrings the code.
 
 mkdocstrings reads sources without importing them, so it does not know that `losses/` is installed as `kgs.losses`:
-it gets a copy of the sources laid out as they are installed.
+it gets a copy of the sources laid out as they are installed, without the roles of Sphinx, which it would show as text.
 """
 
 import re
@@ -24,6 +24,9 @@ def on_config(config):
     """Copies the sources to where mkdocstrings looks."""
     for folder, target in PACKAGES.items():
         shutil.copytree(ROOT / folder, Path(_installed.name, target), dirs_exist_ok=True)
+    for path in Path(_installed.name).rglob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        path.write_text(re.sub(r":(?:attr|class|func|meth|mod):(?=`)", "", text), encoding="utf-8")
     config.plugins["mkdocstrings"].config.handlers["python"]["paths"] = [_installed.name]
     return config
 

@@ -90,6 +90,7 @@ def save_compressed_ply(path: str | os.PathLike[str], model: GaussianModel, offs
     lines = [
         "ply",
         "format binary_little_endian 1.0",
+        f"comment kgs sh_degree {model.sh_degree}",
         *(["comment SplatRenderMode: mip"] if model.antialiased else []),
         f"element chunk {len(chunks)}",
         *(f"property float {name}" for name in BOUNDS),

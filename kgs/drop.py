@@ -18,12 +18,15 @@ from typing import Any
 import torch
 from torch import Generator, Tensor, nn
 
-Rate = float | Tensor
 _is_wrapped = getattr(torch._C._functorch, "is_functorch_wrapped_tensor", lambda _: False)  # by vmap, grad, ...
 
 
 def drop_gaussian(
-    opacities: Tensor, p: Rate = 0.2, training: bool = True, generator: Generator | None = None, scale: bool = True
+    opacities: Tensor,
+    p: float | Tensor = 0.2,
+    training: bool = True,
+    generator: Generator | None = None,
+    scale: bool = True,
 ) -> Tensor:
     """Set each opacity to 0 with probability p and multiply the others by 1/(1 - p).
 
@@ -52,7 +55,8 @@ class DropGaussian(nn.Module):
 
     The rate of a call is `p * schedule(progress)`. The training loop sets `progress`, in [0, 1]; a layer whose progress
     is never set is plain dropout at p. The first call in `train()` warns about that, and about opacities outside
-    [0, 1], which are probably logits. The `state_dict` is empty. `torch.compile` runs the layer outside its graphs.
+    [0, 1], which are probably logits. The `state_dict` is empty. `torch.compile` runs the layer outside its
+    graphs, so `fullgraph=True` raises in `train()`.
 
     Args:
         p: as in :func:`drop_gaussian`, at the end of the schedule. The attribute may be set anew.
@@ -70,7 +74,7 @@ class DropGaussian(nn.Module):
 
     def __init__(
         self,
-        p: Rate = 0.2,
+        p: float | Tensor = 0.2,
         schedule: str | Callable[[float], float] = "linear",
         seed: int | None = None,
         device: torch.device | str = "cpu",
@@ -101,7 +105,7 @@ class DropGaussian(nn.Module):
         self._progress = float(_fraction("progress", value, closed=True))
 
     @property
-    def rate(self) -> Rate:
+    def rate(self) -> float | Tensor:
         """The drop rate of the next call in `train()`, or the rates."""
         factor = self.progress if self.schedule == "linear" else 1.0
         if callable(self.schedule):
@@ -161,11 +165,12 @@ class DropGaussian(nn.Module):
         p = f"tensor of shape {tuple(self.p.shape)}" if isinstance(self.p, Tensor) else f"{self.p:g}"
         name = getattr(self.schedule, "__name__", self.schedule)
         progress = "1.0 (never set)" if self._progress is None else f"{self._progress:g}"
+        progress = "" if self.schedule == "constant" else f", progress={progress}"
         seed = "" if self.seed is None else f", seed={self.seed}"
-        return f"p={p}, schedule={name}, progress={progress}{seed}" + ("" if self.scale else ", scale=False")
+        return f"p={p}, schedule={name}{progress}{seed}" + ("" if self.scale else ", scale=False")
 
 
-def _dropped(x: Tensor, rate: Rate, generator: Generator | None, scale: bool) -> tuple[Tensor, Tensor]:
+def _dropped(x: Tensor, rate: float | Tensor, generator: Generator | None, scale: bool) -> tuple[Tensor, Tensor]:
     """The opacities after dropping, and the factors of them that do it."""
     if not isinstance(x, Tensor) or not x.is_floating_point():
         raise TypeError(f"opacities: expected a floating point tensor, got {getattr(x, 'dtype', x)!r}")
@@ -194,7 +199,7 @@ def _warn(message: str) -> None:
     warnings.warn(f"DropGaussian: {message}", stacklevel=outside.index(True) + 1)
 
 
-def _fraction(name: str, value: Any, closed: bool = False) -> Rate:
+def _fraction(name: str, value: Any, closed: bool = False) -> float | Tensor:
     """A float, or a tensor of several; ValueError unless in [0, 1), or where `closed` in [0, 1] but for rounding."""
     many = isinstance(value, Tensor) and value.numel() != 1
     if many and not closed and bool(((value >= 0) & (value < 1)).all()):

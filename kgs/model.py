@@ -163,7 +163,8 @@ class GaussianModel(nn.Module):
     def forward(self, *, backend: str | Backend = "auto") -> Gaussians:
         """The Gaussians: activated scales and opacities, and harmonics up to the active degree.
 
-        A Gaussian whose scale overflows has an infinite one, without gradient, and is not rendered.
+        A Gaussian whose scale overflows or is NaN has an infinite one, without gradient, and is not rendered; nor is
+        one whose logit is NaN.
 
         Args:
             backend: "auto", or the name of one, see `kgs.backends`. By "triton" differentiable once.

@@ -11,19 +11,21 @@ import torch
 from kgs._support.errors import DataError, listed
 from kgs.datasets.folders import find_models, image_folder
 from kgs.datasets.frames import Frame, FrameSet, PointCloud, find_file
-from kgs.datasets.image_file import ImageFile
+from kgs.datasets.image_file import ImageFile, read_bytes
 from kgs.datasets.images import Intrinsics
 
 from .colmap_model import ColmapCamera, model_file, read_cameras, read_images, read_points
 from .colmap_poses import registered_images
 
-_LISTED = 20
+# With the names of the test views: 3DGS has the first one beside the model, nerfstudio the other in the scene's folder.
+_TEST_LISTS = ("test.txt", "test_list.txt")
 
 
 def load(root: Path, photo_folder: str = "") -> FrameSet:
     """Read the COLMAP model of a scene, of several the largest one.
 
-    Photos that are gone are left out with a note, unless more than half of them are.
+    Photos that are gone are left out with a note, unless more than half of them are. The photos that a list names are
+    test views.
 
     Convention:
         COLMAP's first pixel has its centre at (0.5, 0.5).
@@ -49,9 +51,32 @@ def load(root: Path, photo_folder: str = "") -> FrameSet:
         ids[path] = image_id
     gone = [frame.name for frame in frames if not frame.path.is_file()]
     if 0 < len(gone) <= len(frames) / 2:
-        notes += (f"left out, because the file is gone: {len(gone)} of {len(frames)} photos ({listed(gone, _LISTED)})",)
+        notes += (f"left out, because the file is gone: {len(gone)} of {len(frames)} photos ({listed(gone)})",)
         frames = [frame for frame in frames if frame.path.is_file()]
-    return FrameSet(frames, model_points=lambda t: track_points(folder, {ids[f.path] for f in t}), notes=notes)
+    train, test, on_list = _split_by_list(root, folder, frames)
+    notes += on_list
+    return FrameSet(train, test, model_points=lambda t: track_points(folder, {ids[f.path] for f in t}), notes=notes)
+
+
+def _split_by_list(
+    root: Path, folder: Path, frames: list[Frame]
+) -> tuple[list[Frame], list[Frame] | None, tuple[str, ...]]:
+    """The training and test views that a list of names leaves, in the order of their names, and notes on the list.
+
+    Without a list, or if it leaves one of them empty, all frames and None.
+    """
+    lists = [path for path in (at / name for name in _TEST_LISTS for at in (folder, root)) if path.is_file()]
+    if not lists:
+        return frames, None, ()
+    names = {line.strip() for line in read_bytes(lists[0]).decode("utf-8-sig", "replace").splitlines()} - {""}
+    by_name = sorted(frames, key=lambda frame: frame.name)
+    train = [frame for frame in by_name if frame.name not in names]
+    test = [frame for frame in by_name if frame.name in names]
+    if not train or not test:
+        return frames, None, (f"{lists[0].name} is not used: it names {len(test)} of {len(frames)} photos",)
+    unknown = sorted(names.difference(frame.name for frame in test))
+    notes = (f"{lists[0].name} names photos that are not there: {listed(unknown)}",) if unknown else ()
+    return train, test, notes
 
 
 def largest_model(root: Path) -> tuple[Path, tuple[str, ...]]:
@@ -66,7 +91,7 @@ def largest_model(root: Path) -> tuple[Path, tuple[str, ...]]:
     largest = max(folders, key=counts.__getitem__)
     others = [f"{folder.relative_to(root)} has {counts[folder]}" for folder in folders if folder != largest]
     name = largest.relative_to(root)
-    note = f"{name} is the COLMAP model that is read, with {counts[largest]} images: {', '.join(others[:_LISTED])}"
+    note = f"{name} is the COLMAP model that is read, with {counts[largest]} images: {listed(others)}"
     return largest, (note,)
 
 

@@ -23,7 +23,7 @@ def missing(package: str) -> str:
 
 def installing(extra: str) -> str:
     """The commands that install an extra."""
-    return f'pip install -e ".[{extra}]" in a clone of kgs, or pip install "kgs-splat[{extra}]" where an index has it'
+    return f'pip install ".[{extra}]" in a clone of kgs, or pip install "kgs-splat[{extra}]" where an index has it'
 
 
 def check_opencv() -> None:

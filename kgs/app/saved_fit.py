@@ -60,7 +60,7 @@ def load_fit(
     metrics = read_json(out / "metrics.json")
     values, damage = newest_checkpoint(path)
     with errors_of(path), state_errors():
-        check_plain(values, "backend", "near_plane", "notes", "step")
+        check_plain(values, "backend", "decisions", "near_plane", "notes", "step")
         settings = Settings.from_dict(values["config"])
         model = GaussianModel(**values["model"])
         part = values.get("shown", {})
@@ -85,7 +85,7 @@ def load_fit(
 def _exposed(scene: Scene, path: Path, values: dict[str, Any]) -> Scene:
     """The scene, with the gains of the training photos that were decided."""
     try:
-        return with_exposure(scene, Decisions.from_dict(values.get("decisions", {})))
+        return with_exposure(scene, Decisions.from_dict(values["decisions"]))
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(path, "decisions", f"the gains of {len(scene.train)} photos", str(error)) from error
 

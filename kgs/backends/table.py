@@ -73,8 +73,8 @@ class Backend:
         max_width: of images that it composites, in pixels.
         max_absgrad_features: how many features it composites with `RasterOptions.absgrad`.
         has_torch_on_one_thread: whether torch runs on one thread beside it, see `kgs._support.torch_threads`.
-        is_named: whether a user, or the fit that goes on, asked for it by name: then :meth:`covering` refuses what it
-            does not cover. A stage may still call torch for a part of its cases, as other lenses.
+        is_named: whether the user asked for it by name: then :meth:`covering` refuses what it does not cover. A stage
+            may still call torch for a part of its cases, as other lenses.
         activate, project, compositor, blend: the stages of a render.
         loss, loss_gradient, local_moments: of the photometric loss; None where `kgs.losses` computes it in torch.
         adam_step, add_gradient_norms, decay_opacity: of what a fit does with gradients, in place: all three, or None

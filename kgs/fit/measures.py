@@ -8,6 +8,7 @@ from kgs._support.machine import peak_rss_mb, versions
 from kgs.metrics.coverage import psnr_by_coverage
 from kgs.metrics.evaluate import MEASURES, evaluate_images, views_to_correct
 from kgs.metrics.lpips import Lpips
+from kgs.metrics.outlines import outline_levels
 
 from .fit import Fit
 
@@ -17,7 +18,9 @@ _INIT_NOTES = {
     "scene": "initial points that come with the layout",
     "file": "initial points of a file",
 }
+_MIN_STEPS = 300  # of a fit that shows outlines where the photos let it
 _CONVENTIONS = {
+    "outlines": "training views, PSNR of squares of a 24th of the longer side that another view shows",
     "color_corrected": "test views, each channel of a render with the gain and offset that fit its photo best",
     "ssim": "Kornia, 11 x 11, reflect padded; ssim_zero_padded as the published tables",
     "lpips": "VGG16 v0.1, inputs in [-1, 1]; lpips_vgg_unscaled with inputs in [0, 1] as the published tables",
@@ -62,6 +65,7 @@ def measure(fit: Fit, lpips: Lpips | None = None) -> dict[str, Any]:
         poses += ", those of the training views refined by the fit"
     everywhere = all(views.valid_mask is None for views in (scene.train, scene.test))
     pixels = "all pixels" if everywhere else "the pixels that count; SSIM and LPIPS take the others as equal"
+    is_long = fit.history.get("steps", 0) >= _MIN_STEPS
     train = fit.train_renders
     test = fit.test_renders
     color_corrected = {}
@@ -72,6 +76,7 @@ def measure(fit: Fit, lpips: Lpips | None = None) -> dict[str, Any]:
         "test": evaluate_images(test.images, scene.test, lpips) if len(scene.test) else None,
         **color_corrected,
         "train": evaluate_images(train.images, scene.train, lpips),
+        "outlines": outline_levels(scene.train, train.images, train.median_depths) if is_long else {},
         "seen": psnr_by_coverage(scene, train.median_depths, test.images, test.median_depths),
         **fit.history,
         "decisions": fit.decisions.to_dict(),

@@ -90,7 +90,10 @@ class Trainer:
         """Train on from a state, on a scene with the gains that were decided."""
         config = self.plan.config
         self.state = state
-        self._backend = get_backend(self.plan.backend, self.plan.device)
+        self._backend = replace(
+            get_backend(self.plan.backend, self.plan.device),
+            is_named=config.backend != "auto",  # else torch may take its place
+        )
         self.renderer = GaussianRenderer(
             state.drop,
             near_plane=state.start.near_plane,

@@ -14,8 +14,6 @@ from kgs.stages import blend, project, rasterize
 from .arguments import as_kgs, check_words, refuse
 from .meta import Pairs
 
-_FAR = 1e10  # gsplat's default far plane, which means none
-
 
 def rasterization(  # noqa: D417 - arguments without effect are described together
     means: Tensor,
@@ -28,7 +26,7 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
     width: int,
     height: int,
     near_plane: float = RasterOptions.near_plane,
-    far_plane: float = _FAR,
+    far_plane: float = 1e10,
     radius_clip: float = RasterOptions.radius_clip,
     eps2d: float = RasterOptions.eps2d,
     sh_degree: int | None = None,
@@ -144,7 +142,7 @@ def rasterization(  # noqa: D417 - arguments without effect are described togeth
         max_bytes=max_bytes,
         absgrad=absgrad,
     )
-    endless = options.far_plane >= _FAR
+    endless = options.far_plane >= 1e10  # the default
     options = dataclasses.replace(options, tile_size=None, far_plane=math.inf if endless else options.far_plane)
     has_image = "RGB" in render_mode
     gaussians, cameras, features_per_camera = as_kgs(

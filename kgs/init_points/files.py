@@ -1,13 +1,14 @@
 """Initial points from a file: a splat of 3D Gaussian Splatting, or any point cloud or mesh that trimesh reads."""
 
 import re
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from kgs._support.errors import DataError
+from kgs._support.errors import DataError, warn
 from kgs.geometry.harmonics import SH_C0
 from kgs.ply import load_ply
 
@@ -25,11 +26,11 @@ def read_points(path: Path, origin: Tensor | None = None) -> tuple[Tensor, Tenso
 
     Returns:
         Positions `(P, 3)` and RGB in [0, 1] `(P, 3)`, float32. A splat's colours are those of degree 0. A file without
-        colours gives grey.
+        colours gives grey. Points that are not finite are left out with a warning.
 
     Raises:
         DataError: the file is missing or broken; it is an archive, since a small one can hold more than the memory; it
-            is larger than 1 GiB, or than 64 MiB if it is text and no splat; or it has no points, or infinite ones.
+            is larger than 1 GiB, or than 64 MiB if it is text and no splat; or it has no finite points.
     """
     if not path.is_file():
         raise DataError(path, "", "a point cloud or mesh", "no such file")
@@ -46,10 +47,17 @@ def read_points(path: Path, origin: Tensor | None = None) -> tuple[Tensor, Tenso
     for magic, name in _ARCHIVES.items():
         if head.startswith(magic):
             raise DataError(path, "", "a point cloud or mesh", f"a {name} archive", advice="unpack it first")
-    points, colors = _read_splat(path, origin) if is_splat else _read_cloud(path, origin)
-    if not len(points) or not bool(points.isfinite().all()):
-        raise DataError(path, "vertices", "finite points, at least one", len(points))
-    return points, colors
+    points, colors = _read_splat(path, origin) if is_splat else _read_cloud(path, is_ply and is_text, origin)
+    said = re.search(rb"^element +vertex +(\d+)", head, re.MULTILINE)
+    if is_ply and said and not is_splat and int(said[1]) != len(points):
+        raise DataError(path, "vertices", f"{int(said[1])} as its header says", len(points))
+    is_finite = points.isfinite().all(dim=1)
+    count = int(is_finite.sum())
+    if not count:
+        raise DataError(path, "vertices", "at least one finite point", f"none of {len(points)}")
+    if count < len(points):
+        warn(f"{path}: left out, since they are not finite: {len(points) - count} of {len(points)} points")
+    return points[is_finite], colors[is_finite]
 
 
 def _check_size(path: Path, max_bytes: int, why: str = "") -> None:
@@ -65,12 +73,16 @@ def _read_splat(path: Path, origin: Tensor | None) -> tuple[Tensor, Tensor]:
     return model.means.detach(), colors.clamp(0.0, 1.0)
 
 
-def _read_cloud(path: Path, origin: Tensor | None) -> tuple[Tensor, Tensor]:
-    """The vertices that trimesh reads, and their colours or grey."""
+def _read_cloud(path: Path, is_ascii_ply: bool, origin: Tensor | None) -> tuple[Tensor, Tensor]:
+    """The vertices that trimesh reads, and their colours or grey; of an ASCII PLY file with all their digits."""
     import trimesh  # loads SciPy and networkx: half a second, which few fits need
 
     try:
-        geometry: Any = trimesh.load(path, process=False, skip_materials=True)
+        file: Any = path
+        if is_ascii_ply:  # whose header may say float of numbers with more digits, as of map coordinates
+            file = BytesIO(re.sub(rb"(?m)^(property +)float(32)?( +[xyz]\s)", rb"\1double\3", path.read_bytes()))
+        file_type = "ply" if is_ascii_ply else None
+        geometry: Any = trimesh.load(file, file_type=file_type, process=False, skip_materials=True)
         if isinstance(geometry, trimesh.Scene):
             geometry = geometry.to_geometry()
         points = torch.tensor(geometry.vertices, dtype=torch.float64).reshape(-1, 3)
@@ -80,6 +92,8 @@ def _read_cloud(path: Path, origin: Tensor | None) -> tuple[Tensor, Tensor]:
     if origin is not None:
         points = points - origin
     points = points.float()
-    if colors.ndim != 2 or len(colors) != len(points) or colors.shape[1] < 3:  # no colours, or not one for each point
+    has_one_each = colors.ndim == 2 and len(colors) == len(points) and colors.shape[1] >= 3
+    # An XYZ file does not say whether colours, normals or shares of 1 follow: of the latter two nothing is left.
+    if not has_one_each or not bool(((colors[:, :3] > 1) & (colors[:, :3] < 255)).any()):
         return points, torch.full((len(points), 3), 0.5, dtype=torch.float32)
     return points, colors[:, :3].float() / 255.0

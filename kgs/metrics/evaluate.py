@@ -175,6 +175,15 @@ def _measure(image: Tensor, target: Tensor, share: float, lpips: Lpips | None) -
     return dict(zip(MEASURES, values, strict=True))
 
 
+def brightness_note(metrics: dict[str, Any]) -> str:
+    """A sentence about held-out photos that differ in brightness from each other, in colours that were corrected."""
+    level = clipped_psnr(metrics["test"]["psnr"])
+    return (
+        "The photos differ in brightness: held-out renders are measured in the colours that fit their photos best; as "
+        f"they are, PSNR {level:.4g}."
+    )
+
+
 def as_text(metrics: dict[str, Any]) -> str:
     """The metrics of a fit as lines of text."""
     lines = list[str]()
@@ -183,14 +192,16 @@ def as_text(metrics: dict[str, Any]) -> str:
         measured = [f"{title} {held_out[key]:.4g}" for key, title in names.items() if held_out.get(key) is not None]
         names_of = ", ".join(view["name"] for view in held_out["views"])
         lines.append(f"a fit without {names_of} shows it with {', '.join(measured)}")
-    for part in ("test", "color_corrected", "train"):
-        values = metrics.get(part) or {}
+    corrected = metrics.get("color_corrected")
+    for part in ("test", "train"):
+        values = (corrected if part == "test" else None) or metrics.get(part) or {}
         measured = [f"{title} {values[key]:.4g}" for key, title in names.items() if values.get(key) is not None]
         if measured:
             share = values.get("valid")
             where = "" if share is None else f" (of {share:.0%} of the pixels: masks leave out the rest)"
-            adjusted = ", each render in the colours that fit its photo best" if part == "color_corrected" else ""
-            lines.append(f"{'test' if adjusted else part:>5}: {', '.join(measured)}{where}{adjusted}")
+            lines.append(f"{part:>5}: {', '.join(measured)}{where}")
+    if corrected:
+        lines.append(brightness_note(metrics))
     coverage = metrics.get("seen") or {}
     level = coverage.get("psnr")
     rest = coverage.get("psnr_rest")

@@ -8,8 +8,6 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from kgs._support.errors import DataError
 from kgs._support.machine import peak_rss_mb, revision
 from kgs.app.page.pictures import Picture, encoded
@@ -27,12 +25,12 @@ from kgs.init_points import InitialPoints
 from kgs.metrics.evaluate import MEASURES
 from kgs.metrics.lpips import Lpips
 
+from .grid import Cell, tell
 from .overfitting import coadaptation, count_over_threshold
+from .presets import name_of
 from .rivals import Rival, RivalTrainer
-from .running import tell_steps
 
-FULL = "full-model"  # initial points that use test views: an upper bound
-_FULL_MODEL = f"{FULL}: points seen in any two photos that are not test views, refined with test views; not allowed"
+_TOLD = 4  # parts of the steps, after each of which a running cell says how far it is
 
 
 @lru_cache(maxsize=1)
@@ -41,14 +39,13 @@ def load_lpips(folder: str | None) -> Lpips | None:
     return None if folder is None else Lpips.load(folder)
 
 
-def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: str | None = None) -> dict[str, Any]:
+def sparse_cell(cell: Cell, data: str | None = None, lpips_weights: str | None = None) -> dict[str, Any]:
     """Fit once and measure. Fits of one scene, views, start and seed share initial points and the order of views.
 
     Args:
-        cell: "scene" ("synthetic", or a folder below `data`), "views", "downscale", "start" (a kind of
-            initial points, or "full-model": 10 000 points of a COLMAP model of all photos but the test views),
-            "method" (a name, for the report), "seed", and "fit": a "preset" of kgs fit (paper unless given), and the
-            fields of FitConfig and of Rival that are not as it has them.
+        cell: "scene" ("synthetic", or a folder below `data`), "views", "downscale", "start" (a kind of initial
+            points), "method" (a name, for the report), "seed", and "fit": a "preset" of kgs fit (paper unless given),
+            and the fields of FitConfig and of Rival that are not as it has them.
         data: the folder of the scenes; DataError: the scene is not there or damaged.
         lpips_weights: a folder with the weights of VGG16 and LPIPS, or None to leave LPIPS out.
     """
@@ -56,15 +53,13 @@ def sparse_cell(cell: dict[str, Any], data: str | None = None, lpips_weights: st
     scene, points, seconds = _start(data, *begin, cell["fit"].get("preset", "paper"))
     lpips = load_lpips(lpips_weights)
     config, rival = fit_config(cell["start"], cell["seed"], cell["fit"])
-    trainer, fit, result = fit_and_measure(scene, config, points, lpips, rival)
+    trainer, fit, result = fit_and_measure(scene, config, points, lpips, rival, name_of(cell))
     if cell["scene"] == SYNTHETIC and cell["seed"] == 0:  # of other scenes no photo may be published
         result["pictures"] = _pictures(fit)
     result["test_views"] = {view["name"]: view["psnr"] for view in fit.metrics["test"]["views"]}
     result["init"] |= {"seconds": round(seconds, 2)}
     result["coadaptation"] = coadaptation(trainer.model, scene.test, near_plane=fit.options.near_plane)
     result["thresholds"] = count_over_threshold(trainer, points.points)
-    if cell["start"] == FULL:
-        result["protocol"] |= {"init": _FULL_MODEL}
     return result
 
 
@@ -74,16 +69,25 @@ def fit_and_measure(
     points: InitialPoints,
     lpips: Lpips | None = None,
     rival: Rival | None = None,
+    name: str = "",
 ) -> tuple[Trainer, Fit, dict[str, Any]]:
     """One trainer, its fit with metrics, and what every cell stores of it.
 
     "cpu_seconds" are those of training, curve and leaving out, "wall_seconds" those of the training alone.
-    `rival` replaces random dropping.
+    `rival` replaces random dropping; where a grid has started the fit, it shows how far the one of this name is.
     """
+
+    def tell_quarters(trainer: Trainer, _: float) -> bool:
+        steps = trainer.plan.schedule.steps
+        part = _TOLD * trainer.step // steps
+        if _TOLD * (trainer.step - 1) // steps < part < _TOLD:
+            tell(f"{name}: {trainer.step} of {steps} steps")
+        return False
+
     begin = time.process_time()
     trainers = list[Trainer]()
     make_trainer = Trainer if rival is None else partial(RivalTrainer, rival=rival)
-    hooks = Hooks(make_trainer=make_trainer, begun=trainers.append, after_step=tell_steps())
+    hooks = Hooks(make_trainer=make_trainer, begun=trainers.append, after_step=tell_quarters)
     fit = fit_scene(scene, config, points=points, hooks=hooks)
     (trainer,) = trainers
     cpu_seconds = time.process_time() - begin
@@ -133,21 +137,13 @@ def _start(
     config, _ = fit_config(start, seed, {"preset": preset})
     begin = time.process_time()
     with warnings.catch_warnings(action="ignore", category=UserWarning):  # `kind` records a fallback
-        points = _full_model(scene, seed) if start == FULL else choose_points(scene, config)
+        points = choose_points(scene, config)
     return scene, points, time.process_time() - begin
 
 
 def fit_config(start: str, seed: int, fit: dict[str, Any]) -> tuple[FitConfig, Rival | None]:
     """A cell's preset (paper unless `fit` names one) with its start, seed and other settings, and its rival if any."""
-    settings: dict[str, Any] = {"init": "model-points" if start == FULL else start, "seed": seed, **fit}
+    settings: dict[str, Any] = {"init": start, "seed": seed, **fit}
     preset = settings.pop("preset", "paper")
     of_rival = {field.name: settings.pop(field.name) for field in fields(Rival) if field.name in settings}
     return replace(PRESETS[preset], **settings), Rival(**of_rival) if of_rival else None
-
-
-def _full_model(scene: Scene, seed: int) -> InitialPoints:
-    """Points of the model that two photos observe, none of them a test view."""
-    everything = load_scene(scene.root, points="model-points")
-    chosen = torch.randperm(len(everything.points), generator=torch.Generator().manual_seed(seed))[:10_000]
-    points = everything.points[chosen].double() + (everything.offset - scene.offset)
-    return InitialPoints(points.float(), everything.point_colors[chosen], FULL)

@@ -18,7 +18,7 @@ from kgs.fit.config import FitConfig
 def study(
     *,
     out: Out,
-    preset: Literal["quick", "cpu", "field", "field-long", "paper", "beyond", "guard"] = "quick",
+    preset: Literal["quick", "cpu", "field", "paper", "guard"] = "quick",
     processes: IfGiven[int] = None,
     scheduler: IfGiven[str] = None,
     lpips_weights: IfGiven[Path] = None,
@@ -37,18 +37,17 @@ def study(
       kgs study -o study
       KGS_DATA=SCENES kgs study -o study-field --preset field --scenes llff/fern --seeds 0 --list
 
-    Writes sparse.jsonl (beyond.jsonl), a line per finished fit, and the report, also when it is interrupted; the same
+    Writes sparse.jsonl, a line per finished fit, and the report, also when it is interrupted; the same
     command goes on where it stopped. For many machines: `dask scheduler` on one, `dask worker ADDRESS --nthreads 1` on
     each, and --scheduler; docs/sparse-views.md has more on it.
 
     Args:
         out: folder for the results; fits that its JSONL file has are not repeated.
-        preset: quick takes minutes on the built-in scene; cpu hours on the six scenes of KGS_DATA;
-            field hours on the same and more in full size, field-long on three of them with 10 000 steps; paper is the
-            paper's 10 000 steps on every scene there in the size of published tables, for a large machine; beyond
-            measures the default from cameras farther out than the photos', on the built-in room in minutes, with
-            KGS_DATA on three more; guard tells in about 25 minutes on two cores, with KGS_DATA, whether a change of the
-            code has changed the fits of eight scenes: guard.md has them beside stored ones, with the noise of each.
+        preset: quick takes minutes on the built-in scene; cpu hours on the six scenes of KGS_DATA; field hours on the
+            same and more in full size; paper is the paper's 10 000 steps on every scene there in the size of published
+            tables, for a large machine; guard tells in about 25 minutes on two cores, with KGS_DATA, whether a change
+            of the code has changed the fits of eight scenes: guard.md has them beside stored ones, with the noise of
+            each.
         processes: fits at a time, one per core unless given; the seconds of a fit hold for that many at a time.
         scheduler: address of a Dask scheduler whose workers run the fits instead; they find scenes and weights under
             the same paths.
@@ -82,26 +81,19 @@ def study(
     check_installed("pandas", "scipy", "distributed", "matplotlib", "jinja2")
     load_tools()
 
-    from . import beyond, beyond_report, guard, presets
+    from . import guard, presets
     from .cells import sparse_cell
     from .grid import finished_rows, read_rows, run_grid
     from .published import cells_of_table
     from .report import write_report
 
     data = Path(os.environ["KGS_DATA"]) if os.environ.get("KGS_DATA") else None
-    if preset == "beyond":
-        cells = beyond.beyond_cells(data)
-        path = out / "beyond.jsonl"
-        do_cell = beyond.beyond_cell
-        write = beyond_report.write_beyond
-    else:
-        cells = presets.sparse_cells(preset, data)
-        path = out / "sparse.jsonl"
-        do_cell = sparse_cell
-        write = guard.write_guard if preset == "guard" else write_report
-        if data is not None:
-            for setting in presets.too_few_photos(preset, data):
-                print(f"left out: {setting}")
+    cells = presets.sparse_cells(preset, data)
+    path = out / "sparse.jsonl"
+    write = guard.write_guard if preset == "guard" else write_report
+    if data is not None:
+        for setting in presets.too_few_photos(preset, data):
+            print(f"left out: {setting}")
     same = f"--preset {preset}"
     if steps is not None:
         cells = presets.with_steps(cells, steps)
@@ -120,11 +112,11 @@ def study(
         own = "give each preset and number of steps its own folder"
         raise DataError(path, "", f"cells of {same}", "none", advice=own)
     work = partial(
-        do_cell,
+        sparse_cell,
         data=None if data is None else os.path.abspath(data),
         lpips_weights=None if lpips_weights is None else os.path.abspath(lpips_weights),
     )
-    with Results.open(out, "study", marks=("sparse.jsonl", "beyond.jsonl")) as results:
+    with Results.open(out, "study", marks=("sparse.jsonl",)) as results:
         results.begin()
         try:
             if not report_only:

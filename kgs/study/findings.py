@@ -1,15 +1,13 @@
-"""Conclusions of the study: its comparisons as a table and as sentences, and the default's regret."""
+"""Conclusions of the study: its comparisons as a table and as sentences."""
 
-from collections.abc import Iterable
 from itertools import groupby, product
 from operator import itemgetter
-from statistics import fmean
 
 import pandas as pd
 
 from kgs.bench.output import mean_sd
 
-from .pairs import LPIPS, PSNR, STARTS, Difference, difference, grouped, main_cells, noise_floor, wide
+from .pairs import LPIPS, PSNR, STARTS, difference, grouped, main_cells, noise_floor, wide
 from .presets import AUTO, AUTO_OFF, FIXED, OFF, PAPER
 
 _EQUAL = (PAPER, FIXED), ("progressive 0.1", "fixed 0.05"), ("progressive 0.3", "fixed 0.15")
@@ -51,37 +49,9 @@ def findings(frame: pd.DataFrame) -> list[str]:
         counts = f"scenes: {measures[0]['scenes']}, pairs: {measures[0]['pairs']}"
         gains = "; ".join(f"{line['measure']} {line[_MEAN]}" for line in measures)
         sentences.append(f"{what}: {gains} ({counts}).")
-    best_others = [*_best_others(frame, PSNR)]
-    if best_others:
-        worst, _, best, gain = min(best_others, key=lambda one: one[-1].mean)
-        mean = f"{fmean(one[-1].mean for one in best_others):+.2f} dB in the mean of {len(best_others)} scenes"
-        smallest = f"{gain.text(labels=True)} dB on {worst} (over {best})"
-        how = "that one is picked after the fact on the same test views, which flatters it"
-        sentences.append(f"The default over the best other method of each scene: {mean}, at worst {smallest}; {how}.")
     noise = noise_floor(wide(frame, PSNR))
     if noise.freedom:
         single, three = (f"by up to {noise.between_means(n):.2f} dB" for n in (1, 3))
         runs = f"two single runs differ {single}, and two means of three {three}, 95 times in 100"
         sentences.append(f"Where nothing but the seed differs, {runs} ({noise.groups} groups of runs).")
     return sentences
-
-
-def regret(frame: pd.DataFrame) -> list[dict[str, str]]:
-    """The default against the best other method of each scene, by PSNR and by LPIPS."""
-    return [
-        {"scene": scene, "measure": label, "best of the others": name, "out of": str(others)}
-        | {"the default over it (pairs)": f"{gain.text(decimals)} ({gain.pairs})"}
-        for measure, (label, decimals) in _MEASURES.items()
-        for scene, others, name, gain in _best_others(frame, measure)
-    ]
-
-
-def _best_others(frame: pd.DataFrame, measure: str) -> Iterable[tuple[str, int, str, Difference]]:
-    """Each scene, how many other methods it has, the best of them, and the default over it."""
-    for (scene,), cells in grouped(main_cells(frame), "scene"):
-        gains = {name: difference(cells, "method", AUTO, name, measure) for name in cells.method.unique()}
-        gains = {name: gain for name, gain in gains.items() if gain.pairs}
-        sign = -1 if measure == LPIPS else 1
-        if gains:
-            best = min(gains, key=lambda name: sign * gains[name].mean)
-            yield scene, len(gains), best, gains[best]

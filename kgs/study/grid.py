@@ -1,30 +1,25 @@
 """Runs the cells of an experiment on Dask, each once: a finished cell is a line of a file, and is not done again."""
 
-import asyncio
 import json
 import logging
 import os
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from distributed import Client, KilledWorker, LocalCluster, Security, as_completed
-from distributed.core import rpc
+from distributed import Client, KilledWorker, LocalCluster, as_completed, get_worker
 
 from kgs._support.errors import ArgumentError, DataError, quoted
-
-from .running import Running
 
 Cell = dict[str, Any]
 Work = Callable[[Cell], dict[str, Any]]
 _key = json.JSONEncoder(sort_keys=True).encode  # a cell as text
 PATIENCE = 10  # seconds for a scheduler to answer
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS")  # torch takes the second, which Dask sets to 1, before the first
-_LOST = ("scheduler", "one that stays until the last cell", "a lost connection")
+_TOPIC = "kgs-study"  # of the scheduler's events: lines of running cells
 
 
 def run_grid(
@@ -51,7 +46,7 @@ def run_grid(
         scheduler: address of a Dask scheduler, whose workers do the cells instead; they need the same packages and
             data.
         say: takes a line of text for the user.
-        name: what a cell is called in these lines, and beside its steps while it runs.
+        name: what a cell is called in these lines.
 
     Raises:
         ArgumentError: two cells are equal, `processes` is below 1, or the scheduler does not answer or was lost.
@@ -66,24 +61,34 @@ def run_grid(
     missing = [cell for cell in cells if _key(cell) not in done]
     say(f"{len(cells) - len(missing)} of {len(cells)} cells are there, {len(missing)} to do")
     if missing:
-        running = Running(say)
-        with _client(processes, scheduler) as client, running.listening(client):
-            _do(client, work, missing, path, name, running)
+        with _client(processes, scheduler) as client:
+            client.subscribe_topic(_TOPIC, lambda event: say(event[1]))
+            _do(client, work, missing, path, name, say)
     return finished_rows(cells, path)
 
 
+def tell(line: str) -> None:
+    """Show a line of a running cell where the grid was started; elsewhere than in a worker, nowhere."""
+    with suppress(ValueError, RuntimeError):  # no worker; one that is closing
+        get_worker().log_event(_TOPIC, line)
+
+
 def _do(
-    client: Client, work: Work, cells: Sequence[Cell], path: Path, name: Callable[[Cell], str], running: Running
+    client: Client,
+    work: Work,
+    cells: Sequence[Cell],
+    path: Path,
+    name: Callable[[Cell], str],
+    say: Callable[[str], None],
 ) -> None:
     """Do the cells on the client's workers and append each to the file when it is done."""
     cell_of: dict[Any, Cell] = {}  # of the futures that are not done
     waiting = deque(cells)
-    suspects = deque[Cell]()  # their workers died: each is done alone in the end
+    suspects = deque[Cell]()  # their workers died, maybe of a cell beside them: each is done alone in the end
     alone = False
     finished = 0
     failed = 0
     futures = as_completed()
-    _wait(client, running)
     begin = time.perf_counter()
 
     def submit() -> None:
@@ -91,48 +96,40 @@ def _do(
         if not cell_of and not waiting and suspects:
             alone = True
             waiting.append(suspects.popleft())
-        if not cell_of and waiting:
-            _wait(client, running)  # the last one died
+        if waiting and not cell_of and not _threads(client):
+            say("waiting for a worker")
+            client.wait_for_workers(1)
         free = _threads(client) - len(cell_of)  # a queued cell would be lost with its worker
         for _ in range(min(free, len(waiting))):
             cell = waiting.popleft()
             future = client.submit(work, cell, pure=False)
             cell_of[future] = cell
-            running.begin(future.key, name(cell))
             futures.add(future)
 
     submit()
     for future in futures:
         cell = cell_of.pop(future)
-        running.end(future.key)
         if future.status in ("cancelled", "lost"):
-            raise ArgumentError(*_LOST, advice="run again to go on")
+            raise _lost()
         error = future.exception()
         if isinstance(error, KilledWorker) and not alone:
             suspects.append(cell)
         elif error:
             failed += 1
-            running.say(f"failed: {name(cell)}: {type(error).__name__}: {error}")
+            say(f"failed: {name(cell)}: {type(error).__name__}: {error}")
         else:
             finished += 1
             with path.open("ab") as file:
                 file.write(_key({"cell": cell, "result": future.result()}).encode() + b"\n")
                 file.flush()
                 os.fsync(file.fileno())
-            running.say(f"{finished + failed} of {len(cells)}: {name(cell)}")
+            say(f"{finished + failed} of {len(cells)}: {name(cell)}")
         future.release()  # else Dask does the cell again if this worker dies later
         submit()
     seconds = time.perf_counter() - begin
-    running.say(f"{finished} cells in {seconds:.0f} s, {60 * finished / seconds:.2f} a minute")
+    say(f"{finished} cells in {seconds:.0f} s, {60 * finished / seconds:.2f} a minute")
     if failed:
-        running.say(f"{failed} of {len(cells)} cells failed; run again to try them once more")
-
-
-def _wait(client: Client, running: Running) -> None:
-    """Wait until there is a worker."""
-    if not _threads(client):
-        running.say("waiting for a worker")
-        client.wait_for_workers(1)
+        say(f"{failed} of {len(cells)} cells failed; run again to try them once more")
 
 
 def _threads(client: Client) -> int:
@@ -140,15 +137,24 @@ def _threads(client: Client) -> int:
     try:
         return sum(client.nthreads().values())
     except OSError:
-        raise ArgumentError(*_LOST, advice="run again to go on") from None
+        raise _lost() from None
+
+
+def _lost() -> ArgumentError:
+    expected = "one that stays until the last cell"
+    return ArgumentError("scheduler", expected, "a lost connection", advice="run again to go on")
 
 
 @contextmanager
 def _client(processes: int | None, scheduler: str | None) -> Iterator[Client]:
     """A client of the scheduler at this address, or of processes of this machine."""
     if scheduler is not None:
-        _check_scheduler(scheduler)
-        with Client(scheduler) as client:
+        try:
+            client = Client(scheduler, timeout=PATIENCE)
+        except (OSError, ValueError):  # nothing answers; no address
+            expected = "the address of a running Dask scheduler, as tcp://127.0.0.1:8786"
+            raise ArgumentError("scheduler", expected, repr(scheduler)) from None
+        with client:
             yield client
         return
     cores = os.cpu_count() or 1
@@ -170,22 +176,6 @@ def _client(processes: int | None, scheduler: str | None) -> Iterator[Client]:
     finally:
         for name in set(os.environ) - before:
             del os.environ[name]
-
-
-def _check_scheduler(address: str) -> None:
-    """Raise a ValueError unless a scheduler answers; a Client waits for ever for an open port that says nothing."""
-    with ThreadPoolExecutor(1) as thread:  # the loop of a notebook has this one
-        answer = thread.submit(asyncio.run, _identify(address))
-    kind = answer.exception() or answer.result()
-    if kind != "Scheduler":
-        expected = "the address of a running Dask scheduler, as tcp://127.0.0.1:8786"
-        raise ArgumentError("scheduler", expected, f"{address!r} ({kind!r})")
-
-
-async def _identify(address: str) -> str:
-    """What answers at the address."""
-    async with rpc(address, timeout=PATIENCE, connection_args=Security().get_connection_args("client")) as server:
-        return str((await asyncio.wait_for(server.identity(), PATIENCE))["type"])
 
 
 def read_rows(path: Path, *, repair: bool = False) -> list[dict[str, Any]]:

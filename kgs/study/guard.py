@@ -20,6 +20,8 @@ from .texts import counts, document, signed, table_of
 TITLE = "Has a change of the code changed the fits?"
 STORED = Path(__file__).with_name("guard.jsonl")
 LIMIT = 2.0  # noises; a larger change is marked
+# what the mean of the scenes may lose where a change is kept: dB, LPIPS, and per cent of the time
+MAX_LOSS = {"psnr": 0.1, "lpips": 0.003, "seconds": 10.0}
 Row = Mapping[str, Any]
 _NOTES = (
     "Change: to the stored cell of the same seed, in brackets its noise: sqrt(2) times the standard deviation of the "
@@ -131,6 +133,7 @@ def _tables(new: pd.DataFrame, old: pd.DataFrame, default: pd.DataFrame) -> tupl
     tables = {}
     beyond = list[str]()
     single = list[Change]()
+    of_default = dict[str, Change]()
     for (method,), cells in grouped(new, "method"):
         scenes = [*cells.setting.unique()]
         lines = [{"scene": scene} for scene in scenes]
@@ -144,6 +147,8 @@ def _tables(new: pd.DataFrame, old: pd.DataFrame, default: pd.DataFrame) -> tupl
                 line[measure.head_of_change] = change.text(decimals)
             if len(scenes) > 1 and not math.isnan(error):
                 lines[-1][measure.head_of_change] = f"{error:.{decimals}f}"
+            if method == AUTO:
+                of_default[measure.key] = mean
             single += [change for change in changes if not math.isnan(change.noise)]
             if mean.is_beyond_noise:
                 beyond.append(f"{method}: {measure.head} {mean.text(decimals)}")
@@ -152,7 +157,26 @@ def _tables(new: pd.DataFrame, old: pd.DataFrame, default: pd.DataFrame) -> tupl
     if not single:
         return tables, ["There is nothing stored to tell a change from noise by."]
     verdict = f"Beyond noise in the mean: {'; '.join(beyond)}." if beyond else "No mean has changed beyond noise."
-    return tables, [verdict, f"{count} of {len(single)} changes of single scenes are beyond noise."]
+    counted = f"{count} of {len(single)} changes of single scenes are beyond noise."
+    return tables, [_answer(of_default), verdict, counted]
+
+
+def _answer(means: Mapping[str, Change]) -> str:
+    """Whether a change of the default is to be kept, by its mean over scenes: it gains and loses no more than it may.
+
+    It gains where PSNR or LPIPS is better by more than `LIMIT` noises.
+    """
+    if not means:
+        return "The default was not fitted: there is no verdict."
+    better = {"psnr": means["psnr"], "lpips": means["lpips"]._replace(difference=-means["lpips"].difference)}
+    gains = [key for key, change in better.items() if change.difference > 0 and change.is_beyond_noise]
+    worse = better["psnr"]._replace(difference=-better["psnr"].difference)
+    losses = {"psnr": worse, "lpips": means["lpips"], "seconds": means["seconds"]}
+    lost = [key for key, change in losses.items() if change.difference > MAX_LOSS[key]]
+    if gains and not lost:
+        return f"Yes: it gains in {' and '.join(gains)}, and loses no more than it may."
+    why = f"it loses too much in {' and '.join(lost)}" if lost else "nothing is gained beyond noise"
+    return f"No: {why}."
 
 
 def _changes(

@@ -19,8 +19,7 @@ COLUMNS += ["init.points", "init.seconds", "gaussians", "wall_seconds", "cpu_sec
 ORIGIN = ["revision", "date", "versions.machine"]
 _OTHERS = ["init.kind", "curve", *(f"thresholds.{key}" for key in ("distance", "gaussians", "over")), *ORIGIN]
 _OTHERS += [f"protocol.{key}" for key in ("train", "test", "image_size")]
-_OTHERS += [f"decisions.sh_degree.{key}" for key in ("chosen", "by", "gain")]
-STARTS = ("sift", "random", "model-points", "full-model", "dense", "scene")
+STARTS = ("sift", "random", "model-points", "dense", "scene")
 PSNR = "test.psnr"
 LPIPS = "test.lpips_vgg_unscaled"
 

@@ -18,7 +18,7 @@ from .presets import AUTO, FAMILIES, FIXED, MAIN, OFF, PAPER
 STYLES = {OFF: (WITHOUT, "o"), PAPER: ("#0072B2", "s"), FIXED: ("#D55E00", "^")}
 for _color, _names in zip((DEFAULT, "#E69F00", "#F0E442", "#009E73"), FAMILIES.values(), strict=True):
     STYLES = {**{name: (_color, marker) for name, marker in zip(_names, "vD^p*<>", strict=False)}, **STYLES}
-_FILLS = dict(zip(STARTS, ("none", "left", "bottom", "top", "full", "right"), strict=True))  # of a start's markers
+_FILLS = dict(zip(STARTS, ("none", "left", "bottom", "full", "right"), strict=True))  # of a start's markers
 DPI = 110
 
 

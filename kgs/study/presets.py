@@ -11,7 +11,6 @@ from kgs.bench.scenes import SYNTHETIC, check_scenes
 from kgs.datasets import load_scene
 from kgs.fit.config import FitConfig
 
-from .cells import FULL
 from .grid import Cell
 
 OFF = "off"
@@ -56,7 +55,6 @@ _FITS: dict[str, dict[str, Any]] = {
     "quick": {"steps": 200, "max_gaussians": 12_000},
     "cpu": {"steps": 2000},
     "field": {"steps": 2000},
-    "field-long": {"steps": 10_000},
     "paper": {"steps": 10_000},
     "guard": {"steps": 700},
 }
@@ -67,7 +65,7 @@ def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
     """The cells of a preset, the most telling ones first, those of one start together.
 
     Args:
-        preset: "quick", "cpu", "field", "field-long", "paper" or "guard", as the help of `kgs study` says of them.
+        preset: "quick", "cpu", "field", "paper" or "guard", as the help of `kgs study` says of them.
         data: the folder of the scenes: `llff/fern` and so on; DataError: None, or a scene is missing.
     """
     if preset not in _FITS:
@@ -83,7 +81,7 @@ def sparse_cells(preset: str, data: Path | None) -> list[Cell]:
     elif data is None:
         raise DataError(Path("KGS_DATA"), "", f"this environment variable for the preset {preset!r}", "none")
     else:
-        blocks_of = {"cpu": _cpu, "field": _field, "field-long": _field_long, "paper": _paper, "guard": _guard}
+        blocks_of = {"cpu": _cpu, "field": _field, "paper": _paper, "guard": _guard}
         blocks = blocks_of[preset](data)
     fits = {method: _FITS[preset] | settings for method, settings in METHODS.items()}
     if preset in ("field", "guard"):
@@ -144,7 +142,7 @@ def _cpu(data: Path) -> list[Block]:
     check_scenes(data, SCENES)
     fern = [("llff/fern", 3)]
     rivals = [name for name in METHODS if name not in (*MAIN, *AUTOS)]
-    bounds = ("random", "model-points", FULL)  # no fit may have the last two
+    bounds = ("random", "model-points")  # no fit may have the last one
     return [
         *_by_seed((scene, methods) for methods in (MAIN, AUTOS) for scene in SCENES.items()),
         *[([seed], MORE_VIEWS, ["dense"], methods) for seed in SEEDS for methods in ((OFF, PAPER), AUTOS)],
@@ -173,11 +171,6 @@ def _joined(data: Path) -> list[tuple[str, int]]:
     there = {scene: counts for scene, counts in JOINED.items() if (data / scene).is_dir()}
     settings = [(scene, views) for scene, counts in there.items() for views in counts]
     return [(scene, views) for scene, views in settings if views <= _training_photos(data / scene)]
-
-
-def _field_long(data: Path) -> list[Block]:
-    check_scenes(data, FORWARD)
-    return _by_seed((scene, (OFF, PAPER, AUTO)) for scene in FORWARD.items())
 
 
 def _guard(data: Path) -> list[Block]:

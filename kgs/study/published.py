@@ -29,10 +29,6 @@ TABLES = (
     ("LLFF", "L1"),
 )
 LAYOUTS = {"LLFF": "llff", "Mip-NeRF 360": "colmap", "Blender": "blender"}  # the folder of a benchmark's scenes
-# PSNR of a public training log of a method that starts from a pretrained matcher and uses monocular depths: 504x378,
-# three views, means of three seeds; of trex another undistortion of the same photos.
-PRIORS = {"llff/fern": 23.84, "llff/flower": 21.41, "colmap/trex": 23.51}
-FIELD_WIDTH = 500  # pixels, at least, of images in the field's size
 
 
 def benchmark_of(scene: str, views: int) -> str | None:
@@ -46,11 +42,6 @@ def published(benchmark: str | None, views: int, method: str) -> str:
     lines = PUBLISHED.query("benchmark == @benchmark and views == @views and method == @method")
     figures = lines[["psnr", "ssim", "lpips"]].drop_duplicates().to_numpy()
     return " or ".join("{:.2f} / {:.3f} / {:.3f}".format(*line) for line in figures) or "-"
-
-
-def priors(scene: str, views: int, width: int) -> str:
-    """The PSNR in `PRIORS` of a scene with three views in the field's size; "-" for others."""
-    return f"{PRIORS[scene]:.2f}" if scene in PRIORS and views == 3 and width >= FIELD_WIDTH else "-"
 
 
 def published_difference(benchmark: str | None, views: int, method: str, base: str) -> str:

@@ -6,10 +6,10 @@ import pandas as pd
 
 from kgs.bench.output import mean_sd
 
-from .findings import headline, regret
+from .findings import headline
 from .pairs import KEYS, LPIPS, PSNR, difference, grouped, main_cells, noise_floor, wide, with_measures
 from .presets import AUTO, AUTO_OFF, FAMILIES, MAIN, OFF, PAPER
-from .published import benchmark_of, priors, published, published_difference
+from .published import benchmark_of, published, published_difference
 from .texts import table_of
 
 QUALITY = {PSNR: "PSNR [dB]", "test.ssim_zero_padded": "SSIM", LPIPS: "LPIPS"}
@@ -24,8 +24,6 @@ _COST = {  # a column, and its decimals
 _HEADLINE = "Paired differences of the means over scenes; those of one scene have their interval over seeds"
 _TITLE = """Test views: mean (sd) over n seeds; paired differences over off with their 95 % intervals; the paper's \
 figures are means of all its scenes after more steps, best of five runs: comparable in direction, not in level"""
-_REGRET = """Regret: the default against the best of a scene's other methods, picked after the fact on the same test \
-views; that flatters what is picked, the more so out of many"""
 _NOISE = "Noise between seeds under identical settings, pooled, and the difference that it makes 1 time in 20"
 BEST_OF_5 = 1.163  # how far the best of five runs lies over the mean on average, in standard deviations
 HEAD = (*MAIN, AUTO, AUTO_OFF)
@@ -43,7 +41,6 @@ def sparse_tables(frame: pd.DataFrame) -> dict[str, pd.DataFrame]:
         _HEADLINE: headline(frame),
         _TITLE: _settings(main) + _means(main),
         default: _settings(dense, methods, bases) + _means(main, methods, bases),
-        _REGRET: regret(frame),
         "Numbers of views": _by_views(dense),
         "Initial points": _starts(frame),
     }
@@ -51,7 +48,6 @@ def sparse_tables(frame: pd.DataFrame) -> dict[str, pd.DataFrame]:
         scenes = main[main.method.isin({*FAMILIES[title]} - {*HEAD})].scene
         tables[title] = _settings(main[main.scene.isin(scenes)], (OFF, PAPER, *FAMILIES[title]), (OFF, PAPER))
     tables |= {
-        "The degree of harmonics that was chosen, by seed": _degrees(frame),
         _NOISE: _noise(frame),
         "Cost, overfitting and co-adaptation: mean (sd) over n seeds": _costs(main),
         "Scenes, splits and settings": _protocol(frame),
@@ -116,12 +112,7 @@ def _compared(cells: pd.DataFrame, methods: Iterable[str], mean: str = "", bases
         return []
     benchmarks = {(benchmark_of(scene, views), views) for (scene, views), _ in grouped(cells, *KEYS[:2])}
     benchmark, views = benchmarks.pop() if len(benchmarks) == 1 else (None, 0)  # that all these cells are from
-    if mean:
-        name = mean.format(len(scenes), ", ".join(scene.rpartition("/")[2] for scene in scenes))
-        with_priors = "-"
-    else:
-        name = _setting(cells)
-        with_priors = priors(scenes[0], cells.views.iloc[0], max(cells["protocol.image_size"].iloc[0]))
+    name = mean.format(len(scenes), ", ".join(scene.rpartition("/")[2] for scene in scenes)) or _setting(cells)
     lines = Lines()
     for method in methods:
         if cells[cells.method == method].scene.nunique() < len(scenes):
@@ -133,22 +124,9 @@ def _compared(cells: pd.DataFrame, methods: Iterable[str], mean: str = "", bases
         for base in bases:
             line[f"over {base} [dB] (pairs)"] = _gain(cells, method, base)
             line[f"LPIPS over {base}"] = difference(cells, "method", method, base, LPIPS).text(3)
-        line["pretrained priors: PSNR"] = with_priors
         line["paper: PSNR / SSIM / LPIPS"] = published(benchmark, views, method)
         for base in bases:
             line[f"paper: over {base}"] = published_difference(benchmark, views, method, base)
-        lines.append(line)
-    return lines
-
-
-def _degrees(frame: pd.DataFrame) -> Lines:
-    decided = frame.rename(columns=lambda name: name.removeprefix("decisions.sh_degree."))
-    decided = decided[decided.chosen.notna()].sort_values("seed", kind="stable")
-    lines = []
-    for (scene, views, method), cells in grouped(decided, *KEYS[:2], "method"):
-        line = {"scene": f"{scene}, {views} views", "method": method, "by": ", ".join(cells.by.unique())}
-        line["chosen"] = ", ".join(f"{degree:.0f}" for degree in cells.chosen)
-        line["possible gain of degree 3 [dB]"] = ", ".join(f"{gain:+.2f}" for gain in cells.gain.dropna()) or "-"
         lines.append(line)
     return lines
 
@@ -161,7 +139,7 @@ def _starts(frame: pd.DataFrame) -> Lines:
         same = frame[(frame.scene == scene) & (frame.views == views)]
         for (start,), some in grouped(cells, "start"):
             others = sorted({*some["init.kind"]} - {start}) if start in ("dense", "sift") else []
-            note = " (sees test views)" if start in ("model-points", "full-model") else ""
+            note = " (sees test views)" if start == "model-points" else ""
             line = {"scene": f"{scene}, {views} views", "method": method}
             line["start"] = f"{start} (gave {', '.join(others)})" if others else start + note
             line |= _spread(some[PSNR])

@@ -18,15 +18,19 @@ import pytest
 import torch
 import tyro
 from command import one_line, run
+from factories import random_model
 
 import kgs
 from kgs._support.json_files import write_json
 from kgs.app.cli.fit import first_config
 from kgs.app.cli.run import COMMANDS, load_command
+from kgs.app.cli.size import with_size
 from kgs.app.cli.tools import explain_import_error, load_package, load_tools
 from kgs.app.details import DETAILS
 from kgs.app.files.fit_files import CHECKPOINT, EXPORTS, FILMS, PREVIOUS
 from kgs.app.files.results import Results
+from kgs.app.scene_request import SceneRequest
+from kgs.datasets.source import SceneSource
 from kgs.errors import ArgumentError, DataError, PhotosRefused, TrainingDiverged
 from kgs.fit.config import DROP, PAPER, PRESETS, FitConfig
 
@@ -62,7 +66,7 @@ def test_metrics_have_the_agreed_keys_and_say_what_the_splat_and_config_do(fitte
     metrics = json.loads((fitted / "metrics.json").read_text())
     assert set(metrics) == {
         "test", "train", "curve", "seconds", "peak_rss_mb", "gaussians", "decisions", "steps", "seed", "drop", "init",
-        "backend", "protocol", "versions", "seen", "poses",
+        "backend", "protocol", "versions", "seen", "poses", "outlines",
     }  # fmt: skip
     assert set(metrics["test"]) == {"psnr", "ssim", "ssim_zero_padded", "lpips_vgg", "lpips_vgg_unscaled", "views"}
     assert metrics["test"]["lpips_vgg"] is None
@@ -176,8 +180,20 @@ def test_versions(capsys, monkeypatch):
     assert lines["kgs"] == kgs.__version__
     assert {"torch", "kornia", "opencv", "python", "machine"} <= lines.keys()
     monkeypatch.setattr("kgs._support.machine.versions", lambda: {"kgs": "1"})
-    assert run("--version") == 0
+    assert run("-V") == 0
     assert "numba is not installed" in capsys.readouterr().out
+
+
+def test_of_an_option_that_is_given_twice_the_last_one_counts(tmp_path):
+    kgs.save_ply(tmp_path / "splat.ply", random_model(10, 0))
+    assert run("export", tmp_path / "splat.ply", "-o", tmp_path / "a.ply", "--out", tmp_path / "b.ply") == 0
+    assert sorted(os.listdir(tmp_path)) == ["b.ply", "splat.ply"]
+
+
+@pytest.mark.parametrize(("size", "downscale"), [(20, 2.0), (40, 1.0), (9999, 1.0)])
+def test_a_size_never_enlarges_photos(folder, size, downscale):
+    """Those of the folder have 40 pixels."""
+    assert with_size(SceneRequest(str(folder)), SceneSource(folder), size).downscale == downscale
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -69,10 +69,10 @@ def test_it_says_what_the_fit_knows(fitted: Any) -> None:
     text = (out / "index.html").read_text(encoding="utf-8")
     assert "<h1>room</h1>" in text
     assert "mine" not in text
-    assert "<p>Eleven photos. Drag to look around.<" in text
+    assert "<p>Three photos, eight more held out. Drag to look around.<" in text
     assert text.count(' of 11, held out" data-photo') == 8
     assert text.count('<img alt="" src="data:image/jpeg') == 11
-    assert "--detail high" not in text  # the photos have the size of the fit
+    assert "--detail" not in text  # the photos have the size of the fit
     assert "6 of 8 test photos." in text
     assert "No photo was held out" not in text
     assert text.count('class="render"') == 6
@@ -113,7 +113,7 @@ def test_it_says_that_a_larger_fit_is_possible(fitted: Any, tmp_path: Path) -> N
     for downscale, expected in ((1.05, None), (4.0, 128), (100.0, 1000)):
         write_own_page(tmp_path, out, fit, replace(REQUEST, downscale=downscale), {})
         text = (tmp_path / "index.html").read_text(encoding="utf-8")
-        assert re.findall(r"--detail high takes (\d+)", text) == ([] if expected is None else [str(expected)])
+        assert re.findall(r"--detail</span> high takes (\d+)", text) == ([] if expected is None else [str(expected)])
 
 
 def test_thumbnails_show_photos_as_they_were_taken(fitted: Any, tmp_path: Path) -> None:

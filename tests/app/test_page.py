@@ -90,6 +90,31 @@ def test_the_policy_names_the_one_script_and_the_one_style_by_their_sha256(tmp_p
     assert not re.search(r"<[^>]+\s(style|on\w+)=", tags)  # a hash covers no attribute
 
 
+@pytest.mark.parametrize(
+    ("parts", "words"),
+    [
+        ("training training training", "Three photos."),
+        ("training training test", "Two photos, one more held out."),
+        ("training test test", "One photo, two more held out."),
+        ("test test test", "Three photos."),
+    ],
+)
+def test_it_begins_with_the_photos_of_the_fit(tmp_path: Path, parts: str, words: str) -> None:
+    page = replace(content(), photos=PagePhotos(CAMERAS, NAMES, parts.split()))
+    write_page(tmp_path / "a.html", page)
+    assert f"<p>{words} Drag to look around.<" in (tmp_path / "a.html").read_text(encoding="utf-8")
+
+
+def test_no_line_ends_inside_an_option(tmp_path: Path) -> None:
+    """In any sentence, and with the rest of it escaped."""
+    parts = {"notes": ["a --hold-out <b>"], "remarks": ["see --measure"], "left_out": "by --sh-degree 0"}
+    text = write(tmp_path / "a.html", runs={"": {"train": views(33.0)}}, **parts)
+    whole = re.findall(r'<span class="option">(.*?)</span>', text)
+    assert sorted(whole) == ["--hold-out", "--hold-out", "--measure", "--measure", "--sh-degree"]
+    assert "</span> &lt;b&gt;</p>" in text
+    assert ".option { white-space: nowrap }" in text
+
+
 def strip_of(text: str) -> list[tuple[str, str]]:
     """The camera and the label of each button of the strip."""
     strip = text[text.index('class="strip"') : text.index('class="tools"')]
@@ -196,6 +221,8 @@ def test_measures_have_their_spread(tmp_path: Path) -> None:
         ({"": {"test": None, "held_out": views(27.0), "train": views(33.0)}}, "27.0 dB, that is close to the photos"),
         ({"": {"test": views(4.9)}}, "4.9 dB, that is not the scene of the photos."),
         ({"": {"views": views(27.0)}}, "PSNR on 1 photo: 27.0 dB."),
+        ({"": {"test": views(23.7), "color_corrected": views(34.45)}}, ": 34.5 dB, that is hard to tell from the"),
+        ({"": {"test": views(23.7), "color_corrected": views(34.45)}}, "differ in brightness"),
         ({"": {"test": {"psnr": None, "views": [{"name": "a", "psnr": None}]}}}, "not measured."),
     ],
 )

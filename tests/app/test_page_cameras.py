@@ -90,6 +90,19 @@ def test_the_arc_of_cameras_all_around_has_no_limit_and_reaches_up_to_them() -> 
     assert (low + high) / 2 == pytest.approx(math.pi / 4)
 
 
+def test_the_arc_and_the_tour_are_those_of_the_cameras_of_the_film() -> None:
+    """Turned pictures too, whose yaw is the pitch of the others."""
+    cameras = [camera(0.0, degrees) for degrees in (-30.0, 0.0, 30.0)]
+    path = batch(*(camera(0.0, degrees) for degrees in (-10.0, 0.0, 30.0)))
+    scene = viewer_scene(batch(*cameras), list("abc"), ["training"] * 3, MEANS, path=path)
+    wide = math.radians(40)
+    for arc, name in ((scene["arc"], "yaw"), (scene["turned"][0]["arc"], "pitch"), (scene["turned"][1]["arc"], "yaw")):
+        assert arc[name][1] - arc[name][0] == pytest.approx(wide)
+    ahead = torch.tensor([pose["rotation"] for pose in scene["tour"]["poses"]])[:, 2]
+    turns = torch.atan2(ahead[:, 0], ahead[:, 2]).rad2deg()
+    assert float(turns.max() - turns.min()) == pytest.approx(40, abs=0.5)
+
+
 def test_a_single_camera_has_a_small_arc_also_one_that_looks_down() -> None:
     assert around(0.0)["arc"]["yaw"] == pytest.approx([-0.15, 0.15])
     down = torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])

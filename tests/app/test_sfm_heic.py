@@ -85,9 +85,10 @@ def test_a_bomb_is_not_decoded(folder, monkeypatch):
 
 def test_without_the_extra_it_is_said_what_to_do(folder, monkeypatch):
     monkeypatch.setattr(folders, "has_heic", lambda: False)
-    said = r"2 of 3 of another kind \(IMG_1\.heic, IMG_2\.HEIC\).*\[heic\].*sips.*magick.*Most Compatible"
-    with pytest.raises(DataError, match=said):
+    said = r"(?s)2 of 3 of another kind \(IMG_1\.heic, IMG_2\.HEIC\).*\[heic\].*sips.*magick.*Most Compatible"
+    with pytest.raises(DataError, match=said) as error:
         find_photos(folder)
+    assert all(len(line) <= 120 for line in str(error.value.advice).splitlines())
     with pytest.raises(DataError, match=r"IMG_3\.jpg: .* got a HEIC photo or a video"):
         open_photos([folder / "IMG_3.jpg"])
 

@@ -163,25 +163,48 @@ def test_which_video_is_meant(tmp_path):
     assert find_video(tmp_path / "nothing.mp4") is None
 
 
-def test_a_video_whose_header_has_no_number_of_frames(tmp_path, monkeypatch):
-    """As recorders write it that do not know yet how long it will be."""
+def thousand_a_second(video: Path) -> Path:
+    """As screen recorders and browsers write Matroska and WebM: the rate is that of the clock."""
+    av = pytest.importorskip("av")
+    lying = video.with_suffix(".mkv")
+    capture = cv2.VideoCapture(str(video))
+    with av.open(str(lying), "w") as container:
+        stream = container.add_stream("ffv1", rate=1000)
+        stream.width, stream.height = SIZE
+        stream.pix_fmt = "bgr0"
+        for i, (_, pixels) in enumerate(iter(capture.read, (False, None))):
+            frame = av.VideoFrame.from_ndarray(pixels, "bgr24")
+            frame.pts, frame.time_base = 33 * i, Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return lying
 
-    class Uncounted:
-        """OpenCV's own class must not be subclassed: it ends the process later."""
 
-        def __init__(self, path, capture=cv2.VideoCapture):
-            self.capture = capture(path)
+def of_length(video: Path, count: int) -> Path:
+    """The header of an AVI says so many frames: 0 where the recorder did not know, or was stopped."""
+    data = bytearray(video.read_bytes())
+    for chunk, at in ((b"avih", 24), (b"strh", 40)):
+        struct.pack_into("<I", data, data.index(chunk) + at, count)
+    video.write_bytes(data)
+    return video
 
-        def get(self, key):
-            return -2.2e17 if key == cv2.CAP_PROP_FRAME_COUNT else self.capture.get(key)
 
-        def __getattr__(self, name):
-            return getattr(self.capture, name)
-
-    video = write_video(tmp_path / "clip.avi", np.linspace(0, 20, 30).tolist())
-    expected = take(video, 4)
-    monkeypatch.setattr(cv2, "VideoCapture", Uncounted)
-    assert take(video.rename(tmp_path / "same.avi"), 4) == expected
+@pytest.mark.parametrize(
+    ("lie", "count"),
+    [
+        (thousand_a_second, 3268),
+        (lambda video: of_length(video, 0), 0),
+        (lambda video: of_length(video, 16), 16),
+        (lambda video: of_length(video, 10**6), 10**6),
+    ],
+    ids=["1000 a second", "none", "few", "many"],
+)
+def test_frames_are_counted_as_they_are_decoded(tmp_path, lie, count):
+    video = write_video(tmp_path / "clip.avi", np.linspace(0, 40, 100).tolist())
+    expected = take(video)
+    lying = lie(video.rename(tmp_path / "same.avi"))
+    assert cv2.VideoCapture(str(lying)).get(cv2.CAP_PROP_FRAME_COUNT) == count
+    assert take(lying) == expected
 
 
 def test_as_many_frames_as_are_asked_for_where_they_are_unevenly_spread(tmp_path):

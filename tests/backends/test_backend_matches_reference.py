@@ -287,6 +287,7 @@ ACTIVATIONS |= {
     f"{name} frozen": {"n": 40, "frozen": name} for name in ("log_scales", "opacity_logits", "sh_dc", "sh_rest")
 }
 ACTIVATIONS |= {"parameters in another order in memory": {"n": 40, "transposed": True}}
+ACTIVATIONS |= {f"{name} that is NaN": {"n": 40, "nan": name} for name in ("log_scales", "opacity_logits")}
 
 
 def activated(model, backend, names):
@@ -304,12 +305,22 @@ def activated(model, backend, names):
 @TRITON
 @pytest.mark.parametrize("case", ACTIVATIONS.values(), ids=ACTIVATIONS)
 def test_activation(kernels, case):
-    given = {"n": 300, "highest": 3, "degree": 3, "names": OUTPUTS, "frozen": None, "transposed": False} | case
+    given = {
+        "n": 300,
+        "highest": 3,
+        "degree": 3,
+        "names": OUTPUTS,
+        "frozen": None,
+        "transposed": False,
+        "nan": None,
+    } | case
     model = random_model(given["n"], given["highest"]).to(kernels.device)
     model.sh_degree = given["degree"]
     with torch.no_grad():
         model.log_scales.mul_(4.0).sub_(3.0)
         model.opacity_logits.mul_(5.0)
+        if given["nan"]:
+            model.get_parameter(given["nan"])[7] = math.nan
     for parameter in model.parameters() if given["transposed"] else ():
         parameter.data = parameter.data.transpose(0, -1).contiguous().transpose(0, -1)
     if given["frozen"]:
@@ -319,11 +330,12 @@ def test_activation(kernels, case):
     assert [x is None for x in gradients.values()] == [x is None for x in right.values()]
     for value, double in zip(values, expected, strict=True):
         assert value.is_contiguous()
-        torch.testing.assert_close(value, double.float(), rtol=5e-7, atol=1e-37)
+        torch.testing.assert_close(value, double.float(), rtol=5e-7, atol=1e-37, equal_nan=True)
     for name in [name for name, x in gradients.items() if x is not None]:
         lost = 2e-7 if name == "opacity_logits" else 1e-37  # 1 - opacity, where that is nearly 1
         assert gradients[name].is_contiguous() or given["transposed"]
         torch.testing.assert_close(gradients[name], right[name].float(), rtol=5e-7, atol=lost)
+    assert not given["nan"] or not gradients[given["nan"]][7].any()
 
 
 BACKGROUNDS = {  # of 3 channels and 2 images, but for the first

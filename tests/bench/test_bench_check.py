@@ -57,7 +57,7 @@ def test_what_is_not_installed_is_no_failure(monkeypatch, capsys):
     monkeypatch.setattr(check, "_examine", lambda *_: ("", True))  # no backend is measured
     monkeypatch.setattr(check, "find_spec", lambda name: None if name == "pycolmap" else real(name))
     assert check.check(device="cpu") == 0
-    assert 'photos without cameras (pip install -e ".[sfm]" in a clone of kgs' in capsys.readouterr().out
+    assert 'photos without cameras (pip install ".[sfm]" in a clone of kgs' in capsys.readouterr().out
 
 
 def test_apples_gpus_are_answered_in_a_line(capsys):

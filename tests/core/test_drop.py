@@ -222,6 +222,7 @@ def test_logits_are_warned_about_once_for_each_layer(values, seed):
 
 def test_repr_says_what_will_happen():
     assert repr(DropGaussian()) == "DropGaussian(p=0.2, schedule=linear, progress=1.0 (never set))"
+    assert repr(DropGaussian(schedule="constant")) == "DropGaussian(p=0.2, schedule=constant)"
     full = repr(at(0.5, p=torch.zeros(5), schedule=math.sqrt, seed=3, scale=False))
     assert full == "DropGaussian(p=tensor of shape (5,), schedule=sqrt, progress=0.5, seed=3, scale=False)"
 

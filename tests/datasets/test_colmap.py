@@ -137,6 +137,30 @@ def test_photos_that_are_gone_are_left_out_and_named(tmp_path: Path) -> None:
     assert all(name in note for name in gone)
 
 
+@pytest.mark.parametrize("name", ["sparse/0/test.txt", "sparse/0/test_list.txt", "test_list.txt"])
+def test_a_list_names_the_test_views(tmp_path: Path, name: str) -> None:
+    """Unless the user says which are held out."""
+    write_colmap(tmp_path)
+    (tmp_path / name).write_bytes(b"\xef\xbb\xbfimg4.png\r\nimg2.png\r\n\r\nimg77.png\r\n")
+    scene = load_scene(tmp_path, 3)
+    assert scene.test.names == ("img2.png", "img4.png")
+    assert scene.train.names == ("img0.png", "img6.png", "img9.png")
+    (note,) = scene.notes
+    assert "img77.png" in note
+    assert load_scene(tmp_path, hold_out=2).test.names == tuple(f"img{i}.png" for i in range(0, COUNT, 2))
+
+
+@pytest.mark.parametrize("named", [range(0), range(COUNT)])
+def test_a_list_that_leaves_no_test_or_training_view_is_not_used(tmp_path: Path, named: range) -> None:
+    write_colmap(tmp_path)
+    expected = load_scene(tmp_path).test.names
+    (tmp_path / "test_list.txt").write_text("\n".join(f"img{i}.png" for i in named))
+    scene = load_scene(tmp_path)
+    assert scene.test.names == expected
+    (note,) = scene.notes
+    assert f"not used: it names {len(named)} of {COUNT}" in note
+
+
 @pytest.mark.parametrize("change", ["backslashes", "img3.PNG", "IMG3.png"])
 def test_names_with_backslashes_or_in_another_case(tmp_path: Path, change: str) -> None:
     write_colmap(tmp_path, text=True, names=[f"cam/img{i}.png" for i in range(COUNT)])

@@ -178,6 +178,12 @@ def test_what_exif_says_of_colours(tmp_path: Path, block: PIL.Image.Exif, is_ado
     assert all("a.png" in note and "sRGB" in note for note in notes)
 
 
+def test_of_many_photos_with_doubtful_colours_three_are_named(tmp_path: Path) -> None:
+    paths = [write(tmp_path / f"{i}.png", patches(), exif(65535)) for i in range(9)]
+    (note,) = color_notes([ImageFile(path) for path in paths])
+    assert note.endswith(": 0.png, 1.png, 2.png and 6 more")
+
+
 def with_chunks(levels: np.ndarray, *chunks: tuple[bytes, bytes]) -> bytes:
     """Exif comes behind the pixels, other chunks before them."""
     data = cv2.imencode(".png", levels[..., ::-1])[1].tobytes()

@@ -84,3 +84,13 @@ def test_poses_that_no_camera_has(index: tuple[Any, Any], value: float) -> None:
     pose[index] = value
     with refused(DataError, path=SOURCE, key="photo.png"):
         Frame(SOURCE, "photo.png", ImageFile(SOURCE), LENS, pose)
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [(28.0, 28.0, 16.0, 12.0), (14.0, 14.0, 8.0, -1.0), (14.0, 14.0, 0.0, 0.0), (1.0, 14.0, 8.0, 6.0)],
+    ids=["of a photo twice as large", "above it", "of a centred image", "shares of the side"],
+)
+def test_lenses_that_no_camera_has(numbers: tuple[float, ...]) -> None:
+    with refused(DataError, path=SOURCE, key="photo.png"):
+        Frame(SOURCE, "photo.png", ImageFile(SOURCE), Intrinsics(16, 12, *numbers), torch.eye(4, dtype=torch.float64))

@@ -36,7 +36,7 @@ IN_ORDER = [
         "COLMAP model is not used: expected its photos beside it or in images/",
     ),
     *[
-        ([*PHOTOS, other], rf"3 photos without camera poses.*\. cameras in {other}")
+        ([*PHOTOS, other], rf"3 photos without camera poses.* hold cameras: {other}")
         for other in ("reconstruction.json", "transform_train.json", "scan.XML", "0.xmp", "cameras.csv", "cameras.json")
     ],
 ]

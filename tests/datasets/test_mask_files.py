@@ -44,7 +44,7 @@ def test_masks_are_used_or_counted(
     assert files.masks == {paths[k]: tmp_path / name for k, name in used.items()}
     assert sorted(files.lost) == sorted(tmp_path / name for name in lost)
     assert not files.unused
-    assert [note.split(":")[1].split()[0] for note in files.notes(tmp_path, 9)] == ([str(len(lost))] if lost else [])
+    assert [note.split(":")[1].split()[0] for note in files.notes(tmp_path)] == ([str(len(lost))] if lost else [])
 
 
 NO_PHOTOS = ["IMG_0_mask.png", "IMG_0.jpg.png", "mask_IMG_0.JPG", "IMG_0.jpg_mask.png", "dynamic_mask_IMG_0.png"]
@@ -62,7 +62,7 @@ def test_what_looks_like_a_mask_is_named_and_not_used(tmp_path: Path, name: str)
     in_a_folder = other.parent.name != "images"
     assert not files.masks
     assert files.unused == [other.parent if in_a_folder else other]
-    (note,) = files.notes(tmp_path, 9)
+    (note,) = files.notes(tmp_path)
     assert name.removesuffix("/IMG_0.png") in note
     assert (other in list_images(other.parent)) == (other.name not in NO_PHOTOS)
 

@@ -22,15 +22,7 @@ from kgs.metrics.lpips import Lpips
 ROOT = Path(__file__).parents[2]
 PACKAGES = {"kgs": "kgs", "losses": "kgs.losses", "datasets": "kgs.datasets"}
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-GIVEN = """
-import torch, kgs
-from factories import random_scene
-gaussians, cameras = random_scene(0, torch.float32, sh_degree=None)
-means, quats, scales, colors = gaussians.means, gaussians.quats, gaussians.scales, gaussians.colors
-opacities, logits, total = gaussians.opacities, gaussians.opacities.logit(), 3
-viewmats, Ks, width, height = cameras.extrinsics, cameras.intrinsics[:, :3, :3], 56, 40
-your_rasteriser = lambda *tensors: kgs.GaussianRenderer()(kgs.Gaussians(*tensors), cameras).image
-"""  # what the README takes as the reader's own
+SNIPPETS = sorted((ROOT / "docs" / "snippets").glob("*.py"))
 API = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs" / "api").glob("*.md"))
 
 
@@ -41,21 +33,31 @@ def test_every_public_name_has_a_place_among_the_api_pages():
         assert module in shown or {f"{module}.{name}" for name in importlib.import_module(module).__all__} <= set(shown)
 
 
-@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
-def test_its_python_runs(path, tmp_path, monkeypatch):
+def python_of(path):
+    """The Python that a page shows, in its blocks; `py` marks lines for the code of other projects."""
+    blocks = re.findall(r"^```python\n(.*?)^```", path.read_text(encoding="utf-8"), re.M | re.S)
+    if path.name == "README.md":  # its readers see the file itself
+        return blocks
+    names = [re.fullmatch(r'--8<-- "(snippets/\w+\.py)"\n', block)[1] for block in blocks]
+    return [(ROOT / "docs" / name).read_text(encoding="utf-8") for name in names]
+
+
+def test_the_python_of_the_pages_is_that_of_the_snippets():
+    shown = [block for path in PAGES for block in python_of(path)]
+    assert set(shown) == {path.read_text(encoding="utf-8") for path in SNIPPETS}
+
+
+@pytest.mark.parametrize("path", SNIPPETS, ids=lambda path: path.stem)
+def test_a_snippet_runs_as_pasted(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "lpips", lpips_package)
-    names: dict[str, object] = {}
-    exec(GIVEN, names)
-    for block in re.findall(r"^```python\n(.*?)^```", path.read_text(encoding="utf-8"), re.M | re.S):
-        exec(compile(block, path.name, "exec"), names)
+    exec(compile(path.read_text(encoding="utf-8"), path.name, "exec"), {})
 
 
 def test_the_recipe_of_the_weights_of_lpips_makes_files_that_are_read(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "lpips", lpips_package)
-    text = (ROOT / "docs" / "command.md").read_text(encoding="utf-8")
-    (recipe,) = re.findall(r"^```python\n(.*?import lpips.*?)^```", text, re.M | re.S)
+    (recipe,) = python_of(ROOT / "docs" / "command.md")
     names: dict[str, object] = {}
     with narrow_lpips():
         exec(recipe, names)

@@ -27,7 +27,7 @@ print(kgs.wait_passively(), before, os.environ.get("OMP_WAIT_POLICY"))
 )
 def test_the_policy_is_set_before_torch_is_loaded(variables, before, expected):
     kept = {name: value for name, value in os.environ.items() if name not in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")}
-    run = [sys.executable, "-S", "-c", PROGRAM.format(before=before)]
+    run = [sys.executable, "-c", PROGRAM.format(before=before)]
     done = subprocess.run(
         run, cwd=Path(__file__).parents[2], env=kept | variables, capture_output=True, text=True, check=True
     )

@@ -2,7 +2,6 @@
 
 import base64
 import json
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -10,14 +9,13 @@ import pytest
 import torch
 from study_rows import tiny_cell
 
-from kgs.datasets import load_scene
 from kgs.fit.config import FitConfig
 from kgs.study import cells as cells_module
-from kgs.study.cells import FULL, sparse_cell
+from kgs.study.cells import sparse_cell
 from kgs.study.presets import GUARD, METHODS, SCENES, sparse_cells
 
 
-@pytest.mark.parametrize("preset", ["quick", "cpu", "field", "field-long", "paper", "guard"])
+@pytest.mark.parametrize("preset", ["quick", "cpu", "field", "paper", "guard"])
 def test_each_cell_is_there_once_and_is_a_fit(preset, tmp_path):
     for scene in (*SCENES, *GUARD):
         (tmp_path / scene).mkdir(parents=True, exist_ok=True)
@@ -72,29 +70,6 @@ def test_a_scene_on_the_disk_and_its_own_points(folder):
     assert "come with the layout" in result["protocol"]["init"]
     assert result["protocol"]["image_size"] == [18, 20]
     assert (result["config"]["steps"], result["config"]["drop"]) == (3, 0.0)
-
-
-def test_the_upper_bound_has_the_points_of_all_photos(folder, monkeypatch):
-    """It is moved into the frame of the few views, and drawn by the seed."""
-    cloud = torch.rand(12_000, 3, dtype=torch.float64) * 4 - 2  # in the world of the files
-
-    def with_points(path, views=None, downscale=None, points="none", photo_folder=""):
-        loaded = load_scene(path, views, downscale)
-        if views is not None:
-            return loaded
-        assert points == "model-points"
-        return replace(loaded, points=(cloud - loaded.offset).float(), point_colors=torch.zeros(len(cloud), 3))
-
-    monkeypatch.setattr(cells_module, "load_scene", with_points)
-    few, first, _ = cells_module._start(str(folder.parent), folder.name, 2, None, FULL, 0, "paper")
-    _, other, _ = cells_module._start(str(folder.parent), folder.name, 2, None, FULL, 1, "paper")
-    assert len(first.points) == 10_000
-    assert not torch.equal(first.points, other.points)
-    nearest = torch.cdist(first.points[:100].double() + few.offset, cloud).amin(1)
-    assert float(nearest.max()) < 1e-5
-    result = sparse_cell(tiny_cell(start=FULL) | {"scene": folder.name}, data=str(folder.parent))
-    assert result["init"]["kind"] == FULL
-    assert "not allowed" in result["protocol"]["init"]
 
 
 @pytest.mark.slow

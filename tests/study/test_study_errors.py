@@ -9,7 +9,6 @@ from study_rows import made_up, tiny_cell
 
 from kgs import ArgumentError, DataError
 from kgs.datasets.synthetic import views_beyond
-from kgs.study.beyond import beyond_cell, beyond_cells
 from kgs.study.cells import sparse_cell
 from kgs.study.command import study
 from kgs.study.grid import read_rows, run_grid
@@ -51,9 +50,7 @@ CASES = [
     ("FOLDER: llff/fern", DataError, lambda folder: sparse_cells("cpu", folder)),
     ("FOLDER", DataError, lambda folder: sparse_cells("paper", folder)),
     ("FOLDER: llff/fern", DataError, lambda folder: sparse_cells("guard", folder)),
-    ("FOLDER: llff/fern", DataError, lambda folder: beyond_cells(folder)),
     ("llff/fern", DataError, lambda _: sparse_cell(tiny_cell() | {"scene": "llff/fern"})),
-    ("llff/fern", DataError, lambda _: beyond_cell(tiny_cell() | {"scene": "llff/fern"})),
     *[
         ("out, count", ArgumentError, lambda _, out=out, count=count: views_beyond(out, count, (6, 8)))
         for out, count in ((0.0, 6), (float("nan"), 6), (1.0, 0))

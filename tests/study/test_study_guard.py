@@ -130,6 +130,24 @@ def test_what_is_beyond_two_noises_is_marked(noises, mark, sentence, rows_of, re
 
 
 @pytest.mark.parametrize(
+    ("changes", "verdict"),
+    [
+        ({"change": 2.1}, "Yes: it gains in psnr"),
+        ({"change": 1.9}, "No: nothing is gained beyond noise"),
+        ({"lpips": 0.09}, "Yes: it gains in lpips"),
+        ({"change": 2.1, "factor": 1.2}, "No: it loses too much in seconds"),
+        ({"change": 2.1, "lpips": 0.104}, "No: it loses too much in lpips"),
+        ({"change": -1.0, "lpips": 0.09}, "No: it loses too much in psnr"),
+        ({"methods": (PAPER,)}, "there is no verdict"),
+    ],
+)
+def test_the_verdict_is_yes_or_no(changes, verdict, rows_of, report):
+    """PSNR by noises; LPIPS has none here, so that any gain of it is beyond."""
+    change = changes.pop("change", 0.0) * noise(FERN)
+    assert verdict in report(rows_of(scenes=(FERN,), change=change, **changes))
+
+
+@pytest.mark.parametrize(
     ("seeds", "stored_seeds", "noises"),
     [((0, 1, 2), (0, 1, 2), f" ({noise(FERN) / math.sqrt(3):.2f})"), ((0,), (0,), "")],
     ids=["more seeds have less noise", "one stored seed tells none"],

@@ -8,9 +8,9 @@ import pytest
 from study_rows import MAIN, made_up, psnrs, student
 
 from kgs.bench.output import mean_sd
-from kgs.study.findings import findings, headline, regret
+from kgs.study.findings import findings, headline
 from kgs.study.pairs import Difference, Noise, cells_frame, difference, main_cells, noise_floor, paired_difference, wide
-from kgs.study.published import benchmark_of, priors, published, published_difference
+from kgs.study.published import benchmark_of, published, published_difference
 from kgs.study.tables import BEST_OF_5, sparse_tables
 from kgs.study.texts import counts, document, table_of
 
@@ -183,30 +183,13 @@ def test_the_headline_has_both_intervals_of_psnr_and_lpips(frame, sentences):
     assert (only["scenes"], only["nerfstudio/fox"]) == ("1", "-")
 
 
-def test_regret_is_against_the_best_other_method_of_each_scene(frame, sentences):
-    lines = {(line["scene"], line["measure"]): [*line.values()][2:] for line in regret(frame)}
-    assert lines["llff/fern", "PSNR [dB]"][:2] == ["auto, off", "3"]
-    assert lines["llff/fern", "PSNR [dB]"][2].startswith("+0.41 [")
-    assert lines["nerfstudio/fox", "PSNR [dB]"][:2] == ["progressive 0.2", "2"]
-    assert lines["nerfstudio/fox", "PSNR [dB]"][2].startswith("-0.48 [")
-    assert lines["llff/fern", "LPIPS (less is better)"][0] == "off"  # the least
-    sentence = next(text for text in sentences if "best other method" in text)
-    assert "-0.04 dB in the mean of 2 scenes, at worst -0.48 [" in sentence
-    assert "on nerfstudio/fox (over progressive 0.2)" in sentence
-    assert regret(cells_of({("llff/fern", 3, "off"): [1.0]})) == []
-
-
 @pytest.mark.slow
 def test_the_default_stands_beside_the_others():
-    """On each scene that has it, with the degree that was chosen; the means are over the scenes that a method has."""
+    """On each scene that has it; the means are over the scenes that a method has."""
     settings = [("llff/fern", 3), ("nerfstudio/fox", 12), ("nerfstudio/fox", 6)]
     cells = [(*setting, method) for setting in settings for method in (*MAIN, "auto", "auto, off")]
     cells += [("blender/lego", 8, method) for method in MAIN]
     rows = [made_up(*cell[:2], "dense", cell[2], seed) for cell in cells for seed in range(2)]
-    decided = {"chosen": 3, "by": "photos", "over": 0, "gain": 0.4, "n": 2000}
-    for row in rows:
-        if row["cell"]["method"] == "auto":
-            row["result"]["decisions"] = {"sh_degree": decided if row["cell"]["seed"] else {"chosen": 0, "by": "rule"}}
     tables = sparse_tables(cells_frame(rows))
     main = next(table for title, table in tables.items() if title.startswith("Test views"))
     methods = {scene: [*lines.method] for scene, lines in main.groupby("scene")}
@@ -220,8 +203,6 @@ def test_the_default_stands_beside_the_others():
     auto, paper = (psnrs(rows, "nerfstudio/fox", method, 6) for method in ("auto", PAPER))
     gain = np.subtract(auto, paper).mean()
     assert default[f"over {PAPER} [dB] (pairs)"]["nerfstudio/fox, 6 views, dense"].startswith(f"{gain:+.2f} [")
-    chosen = tables["The degree of harmonics that was chosen, by seed"]
-    assert [*chosen.iloc[0]] == ["llff/fern, 3 views", "auto", "rule, photos", "0, 3", "+0.40"]
 
 
 def test_numbers_that_are_not_there_are_left_out():
@@ -250,9 +231,6 @@ def test_numbers_that_are_not_there_are_left_out():
         (published_difference("LLFF", 3, "fixed 0.1", PAPER), "-0.28"),  # of the same table
         (published_difference("Blender", 8, "fixed 0.1", "off"), "-"),
         (published_difference(None, 3, PAPER, "off"), "-"),
-        (priors("llff/fern", 3, 504), "23.84"),
-        (priors("llff/fern", 3, 252), "-"),
-        (priors("llff/fern", 6, 504), "-"),
     ],
 )
 def test_the_papers_figures(found, expected):

@@ -55,7 +55,7 @@ def _is_of_kgs(path: Path) -> bool:
     """Whether a file begins as the splats and pages that kgs writes."""
     with path.open("rb") as file:
         head = file.read(_HEAD)
-    is_splat = head.startswith(b"ply\n") and any(word in head for word in (b"\ncomment kgs ", b" packed_position\n"))
+    is_splat = head.startswith(b"ply\n") and b"\ncomment kgs " in head
     return is_splat or b'<meta name="generator" content="made by kgs ' in head
 
 

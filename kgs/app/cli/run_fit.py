@@ -113,6 +113,7 @@ def _say_results(fit: "Fit", folder: Path) -> None:
     """How good a fit is, and what was left out of it."""
     from kgs.fit.pruning import left_out
     from kgs.metrics.evaluate import as_text
+    from kgs.metrics.outlines import doubt
 
     metrics = fit.metrics
     sizes = f"{quantity(metrics['gaussians'], 'Gaussian')} after {quantity(metrics['steps'], 'step')}"
@@ -120,6 +121,8 @@ def _say_results(fit: "Fit", folder: Path) -> None:
     say(f"{printable(folder / 'splat.ply')}: {sizes}")
     if needless := left_out(fit.decisions):
         say(needless)
+    if sentence := doubt(metrics["outlines"]):
+        say(sentence)
 
 
 def _say_next_steps(out: Path, side: int, full_side: int | None) -> None:

@@ -102,6 +102,11 @@ def shown(views: Views, degrees: float = 0.0) -> list[Views]:
     ]
 
 
+def shown_poses(views: Views, degrees: float = 0.0) -> Tensor:
+    """The extrinsics of the views as they are looked at, `(V, 4, 4)`; see :func:`shown`."""
+    return torch.cat([part.cameras.extrinsics for part in shown(views, degrees)])
+
+
 def as_taken(image: Tensor, views: Views, index: int) -> Tensor:
     """A picture `(..., H, W)` of one view, turned back if its photo was turned."""
     return torch.rot90(image, 1, (-2, -1)) if views.turned and views.turned[index] else image

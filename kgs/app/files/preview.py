@@ -1,16 +1,14 @@
 """A still of a splat, in the size in which messengers show links and files."""
 
-from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
-from kornia.geometry.camera import PinholeCamera
-from torch import Tensor
 
 from kgs._support.json_files import write_whole
 from kgs.datasets.scene import Views
+from kgs.fit.fit import Fit
 from kgs.geometry.cameras import resized
-from kgs.geometry.rigs import camera_centers
 
 from .images import eight_bits
 
@@ -19,16 +17,16 @@ HEIGHT = 630
 _QUALITY = 90  # of the JPEG
 
 
-def write_preview(path: Path, render: Callable[[PinholeCamera], Tensor], views: Views) -> None:
-    """Write what the camera nearest the middle of all sees, as a JPEG of 1200 x 630 pixels. The write is atomic.
+def write_preview(path: Path, fit: Fit, views: Views, index: int) -> None:
+    """Write what one of the views sees, as a JPEG of 1200 x 630 pixels. The write is atomic.
 
-    The middle of its photo is shown, as much of it as fills that shape. `render` makes an image `(1, 3, H, W)`.
+    The middle of its photo is shown, as much of it as fills that shape.
     """
-    centers = camera_centers(views.cameras.extrinsics)
-    nearest = int((centers - centers.mean(0)).norm(dim=1).argmin())
     height, width = views.images.shape[-2:]
     scale = max(WIDTH / width, HEIGHT / height)
     middle = (scale * width - WIDTH) / 2, (scale * height - HEIGHT) / 2
-    image = render(resized(views.camera(nearest), scale, (HEIGHT, WIDTH), middle))
+    # Of a smaller photo it is the image of the fit, enlarged, as in the page's viewer: without the needles within.
+    options = replace(fit.options, eps2d=fit.options.eps2d * max(1.0, scale) ** 2)
+    image = replace(fit, options=options).render(resized(views.camera(index), scale, (HEIGHT, WIDTH), middle))
     _, content = cv2.imencode(".jpg", eight_bits(image[0]), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     write_whole(path, content.tobytes())

@@ -30,6 +30,7 @@ def viewer_scene(
     parts: Sequence[str],  # what each photo was used for: "training", "test", or another word
     means: Tensor,  # centres of the Gaussians; the viewer orbits a point at their median depth
     psnr: Mapping[str, float] | None = None,  # of the renders of photos, in dB, by their names, if it is known
+    path: PinholeCamera | None = None,  # the cameras of the film; None: those of the training photos
 ) -> dict[str, Any]:
     """The cameras, the one to open at, the upright direction and the size of the pyramids, as plain numbers for JSON.
 
@@ -44,11 +45,12 @@ def viewer_scene(
             the mean pose the one of the highest PSNR, or the nearest where none is known.
         up: the upright direction in the world, of length 1.
         pyramid: depth of the pyramids that stand for the cameras, in world units.
-        arc: how far around the scene the cameras reach, see `_arc`.
+        arc: how far around the scene the cameras of the film reach, see `_arc`.
         turned: `up` and `arc` where the pictures are turned clockwise by one, two and three quarters.
         tour: the rotations and positions of the cameras of the film, see :func:`kgs.app.files.film.resample_by_speed`
             (poses), and its length (seconds).
     """
+    path = training_cameras(cameras, parts) if path is None else to(path, "cpu")
     cameras = to(cameras, "cpu", torch.float64)
     positions = camera_centers(cameras.extrinsics).numpy()
     entries = list[dict[str, Any]]()
@@ -81,9 +83,11 @@ def viewer_scene(
         "cameras": entries,
         "first": first,
         "pyramid": _pyramid_depth(positions, depth),
-        **_up_and_arc(cameras, positions, first, distance),
-        "turned": [_up_and_arc(turned(cameras, quarters), positions, first, distance) for quarters in (1, 2, 3)],
-        "tour": _tour(training_cameras(cameras, parts), means),
+        **_up_and_arc(cameras, path, first, distance),
+        "turned": [
+            _up_and_arc(turned(cameras, quarters), turned(path, quarters), first, distance) for quarters in (1, 2, 3)
+        ],
+        "tour": _tour(path, means),
     }
 
 
@@ -110,7 +114,7 @@ def _nearest_mean_pose(rotations: Array, positions: Array, training: Sequence[bo
     return [int(i) for i in chosen[distances.argsort(kind="stable")]]
 
 
-def _arc(rotations: Array, positions: Array, first: int, distance: float, up: Array) -> dict[str, Any]:
+def _arc(rotations: Array, positions: Array, distance: float, up: Array) -> dict[str, Any]:
     """The angles from which the cameras see the scene, in radians.
 
     An eye looks from the opposite of its forward direction. So does a camera; it also shows what an eye would see that
@@ -121,13 +125,13 @@ def _arc(rotations: Array, positions: Array, first: int, distance: float, up: Ar
         yaw: smallest and largest angle about `up`, counterclockwise; None where the cameras surround the scene.
         pitch: smallest and largest angle above the horizon.
     """
-    focus = positions[first] + distance * rotations[first, 2]
+    focus = positions[0] + distance * rotations[0, 2]
     beside = positions - focus
     beside = beside[np.linalg.norm(beside, axis=1) > 1e-6 * distance]
-    origin = -rotations[first, 2]
+    origin = -rotations[0, 2]
     origin = origin - (origin @ up) * up
     if np.linalg.norm(origin) < 1e-6:  # it looks straight down: the top of its picture is where it looks to
-        origin = rotations[first, 1] - (rotations[first, 1] @ up) * up
+        origin = rotations[0, 1] - (rotations[0, 1] @ up) * up
     origin /= np.linalg.norm(origin)
     directions = np.concatenate([-rotations[:, 2], beside / np.linalg.norm(beside, axis=1, keepdims=True)])
     pitches = np.arcsin((directions @ up).clip(-1, 1))
@@ -144,10 +148,11 @@ def _arc(rotations: Array, positions: Array, first: int, distance: float, up: Ar
     }
 
 
-def _up_and_arc(cameras: PinholeCamera, positions: Array, first: int, distance: float) -> dict[str, Any]:
-    """What is up for these cameras, and their arc."""
+def _up_and_arc(cameras: PinholeCamera, path: PinholeCamera, first: int, distance: float) -> dict[str, Any]:
+    """What is up for these cameras, and the arc of the first one and those of the film."""
     up = common_up(cameras.extrinsics)
-    arc = _arc(cameras.extrinsics[:, :3, :3].numpy(), positions, first, distance, up.numpy())
+    poses = torch.cat([cameras.extrinsics[[first]], path.extrinsics.double()])
+    arc = _arc(poses[:, :3, :3].numpy(), camera_centers(poses).numpy(), distance, up.numpy())
     return {"up": up.tolist(), "arc": arc}
 
 

@@ -38,6 +38,7 @@ class PagePhotos:
     pictures_note: str = ""  # a sentence that says which photos these are
     # some of the photos, RGB `(3, H, W)`, by their names; a click on one flies to its camera. Without any: numbers
     thumbnails: Mapping[str, Tensor] = field(default_factory=dict)
+    path: PinholeCamera | None = None  # the film's cameras, whose arc is the viewer's; None: the training cameras
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from typing import Any
 
 from kgs._support.errors import quantity
 from kgs.app.files.plot import PARTS, Runs, with_run
+from kgs.metrics.evaluate import brightness_note
 
 # Titles and digits of the measures, by their keys in metrics.json.
 MEASURES = {
@@ -65,6 +66,11 @@ def verdict(runs: Runs) -> str:
     if part is None:
         return ""
     measured = {run: metrics[part] for run, metrics in runs.items() if metrics.get(part)}
+    differ = ""
+    for run, metrics in runs.items():
+        if part == "test" and metrics.get("color_corrected"):
+            measured[run] = metrics["color_corrected"]
+            differ = f" {brightness_note(dict(metrics))}"
     levels = {run: values["psnr"] for run, values in measured.items() if values.get("psnr") is not None}
     photos = quantity(len(next(iter(measured.values()))["views"]), "photo")
     which = {
@@ -82,7 +88,7 @@ def verdict(runs: Runs) -> str:
     if part == "held_out":
         return f"{text} This splat was trained on all photos."
     if part != "train":
-        return text
+        return text + differ
     unknown = "No photo was held out, so how good new views are was not measured"
     little = " That says little: it was made to show them." if levels else ""
     return f"{unknown} (kgs fit with --measure or --hold-out does). {text}{little}"

@@ -13,6 +13,7 @@ from kgs._support.errors import DataError
 from kgs._support.json_files import read_json
 from kgs.app.console import each
 from kgs.app.files.cameras import as_taken, shown
+from kgs.app.files.reach import film_views
 from kgs.app.scene_request import SceneRequest
 from kgs.datasets.folders import CAMERAS_REPORT
 from kgs.datasets.load import load_scene
@@ -24,6 +25,7 @@ from kgs.fit.fit import Fit
 from kgs.fit.measures import used_init
 from kgs.fit.pruning import contributions, left_out
 from kgs.geometry.cameras import joined
+from kgs.metrics.outlines import doubt
 
 from .content import PageContent, PagePhotos, PageSplat, PageText
 from .figures import psnr_of_views
@@ -91,6 +93,7 @@ def write_fit_page(
             cameras=joined(*(part.cameras for part in parts)),
             names=[*scene.train.names, *scene.test.names],
             parts=[words[0]] * len(scene.train) + [words[1]] * len(scene.test),
+            path=film_views(fit, roll)[0].cameras,
             pictures=_pictures(pictured, fits, image_of),
             pictures_note=f"{count} of {len(views)} {kind}." if count < len(views) else f"The {kind}.",
             thumbnails={names[i]: images[names[i]] for i in in_strip(names)},
@@ -98,7 +101,7 @@ def write_fit_page(
         text=PageText(
             title,
             runs=runs,
-            notes=notes,
+            notes=[*filter(None, (doubt(run.get("outlines") or {}) for run in runs.values())), *notes],
             remarks=[*(line for run in runs for line in _remarks(run, runs[run])), *remarks],
             settings=_settings(settings or {}, fit.metrics),
             report=_report_facts(found),

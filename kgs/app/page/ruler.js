@@ -1,7 +1,8 @@
 "use strict";
 // Measures the distance between two points of the splat, which a user clicks.
 
-const DISTANCE_DIGITS = 5;  // significant ones of the distance; the coordinates have as many decimals
+const SHOWN_DIGITS = 2;  // significant ones of the distance that is shown
+const DISTANCE_DIGITS = 5;  // likewise of the one that the coordinates in the command have
 
 class Ruler {
   constructor(viewer, frame) {
@@ -44,15 +45,23 @@ class Ruler {
     const digits = clamped(DISTANCE_DIGITS - 1 - Math.floor(Math.log10(distance)), 0, 20);
     const offset = this.viewer.scene.offset ?? [0, 0, 0];
     const [a, b] = this.points.map((point) => add(point, offset).map((value) => value.toFixed(digits)).join(","));
-    this.show(`${distance.toPrecision(DISTANCE_DIGITS)} units apart. With the true length in place of LENGTH, in metres `
+    this.show(`${Number(distance.toPrecision(SHOWN_DIGITS))} units apart. With the true length in place of LENGTH, in metres `
       + "say, this command scales splat, cameras and page to it; OUT is the folder of this page, METRES a new one:",
       `kgs scale OUT --by ${a} ${b} LENGTH -o METRES`);
   }
 
   show(text, command = "") {
     this.words.textContent = text;
-    if (command) this.words.append(document.createElement("br"), document.createElement("code"));
-    if (command) this.words.lastChild.textContent = command;
+    if (command) {
+      const code = document.createElement("code");
+      for (const part of command.split(/(--\w+)/)) {
+        const span = document.createElement("span");
+        span.textContent = part;
+        span.classList.toggle("option", part.startsWith("--"));  // no line ends inside it
+        code.append(span);
+      }
+      this.words.append(document.createElement("br"), code);
+    }
     this.draw();
   }
 

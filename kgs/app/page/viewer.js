@@ -1,7 +1,7 @@
 "use strict";
 // The viewer: an eye that turns around a splat, moves, zooms, and flies to the cameras of the photos and along them, on
 // the path of the film: slowly until it is touched, and at the speed of the film where one plays it. It turns as far
-// around the splat as these cameras do, unless it may roam.
+// around the splat as the cameras of the film do, unless it may roam.
 // OpenCV axes: the rows of a rotation are the directions right, down and forward in the world.
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -15,12 +15,13 @@ const CLICK_PIXELS = 4;  // a pointer that moves farther than this drags
 const FLIGHT_MILLISECONDS = 700;
 const STEEPEST = 1.5;  // largest angle above or below the horizon, in radians
 const ROAMING_ARC = Math.PI;  // radians that a drag across the stage turns where the cameras set no limit
-const SOFT_END = 0.25;  // how far beyond the arc of the cameras the eye can turn, as a share of the arc
+const SOFT_END = 0.1;  // where the eye turns less and less, at either end of the arc, as a share of the arc
 const MIN_COVERAGE = 1 / 3;  // of the stage, by the splat: where the eye roams to
 const MIN_PART = 1 / 2;  // likewise, of what it covers from the photo's camera, where that is less
 const ROAMING_STEP = 0.1;  // radians: how finely this is tested
 const NEAR_CAMERA = 0.02;  // of the distance: an eye farther than this from all cameras is beside them
-const MIN_ZOOM = 0.3, MAX_ZOOM = 3;  // of the distance at the camera that the eye last jumped to
+const NEAREST = 1 / 4;  // of the distance to the surface ahead: where zooming in ends
+const FARTHEST = 3;  // times the distance at the camera that the eye last jumped to
 const SLOW_SECONDS_PER_CAMERA = 4;  // of a tour that nobody asked for
 const TOUR_BEGIN_SECONDS = 2;  // in which the eye joins the path
 const TOUR_STILL_SECONDS = 1.5;  // of each picture, where the system asks for less motion
@@ -41,13 +42,11 @@ function rotated(vector, axis, angle) {
   return vector.map((value, i) => cosine * value + sine * side[i] + along * axis[i]);
 }
 
-// The part of a change of an angle that is left near the ends of an arc: beyond them less and less, down to nothing.
+// The part of a change of an angle that is left near the ends of an arc: less and less, down to nothing.
 function softened(change, angle, [low, high]) {
-  const soft = SOFT_END * (high - low);
-  const beyond = change > 0 ? angle - high : low - angle;
-  const share = clamped(1 - beyond / soft, 0, 1);
-  const [min, max] = [Math.min(angle, low - soft), Math.max(angle, high + soft)];
-  return clamped(angle + share * change, min, max) - angle;
+  const left = change > 0 ? high - angle : angle - low;
+  const share = clamped(left / (SOFT_END * (high - low)), 0, 1);
+  return clamped(angle + share * change, Math.min(angle, low), Math.max(angle, high)) - angle;
 }
 
 const wantsLessMotion = () => matchMedia("(prefers-reduced-motion: reduce)").matches;
@@ -69,7 +68,7 @@ class Viewer {
     this.renderer = renderer;
     this.scene = scene;
     this.redrawRequested = false;
-    this.flight = 0;  // number of the latest movement: an earlier flight stops
+    this.flight = null;  // where and when a flight to the eye began, while it goes on
     this.dragged = 0;  // pixels since the pointer was pressed
     this.pyramids = scene.cameras.map((camera, index) => this.addPyramid(camera, index));
     this.quarters = 0;  // by which all pictures are turned clockwise
@@ -92,6 +91,8 @@ class Viewer {
     const { rotation, position, distance, size, focal, centre } = this.scene.cameras[index];
     this.eye = { rotation, position, distance, size, focal, centre };
     this.usualDistance = distance;
+    this.flight = null;
+    this.surface = distance;  // ahead of the eye at the usual distance, as it was last measured; at most that
     this.chosen = index;
     this.mark(index);
     this.usualCoverage = null;  // not measured yet
@@ -113,23 +114,22 @@ class Viewer {
     });
   }
 
-  // Moves the eye to a camera smoothly.
+  // Moves the eye to a camera smoothly. What turns or moves it meanwhile changes where the flight ends.
   flyTo(index) {
-    const from = this.eye;
+    const from = this.eyeInFlight();
     this.endTour();
     this.jumpTo(index);
-    const to = this.eye;
-    const begin = performance.now();
-    const flight = ++this.flight;
-    const jump = wantsLessMotion();
-    const step = (now) => {
-      if (flight !== this.flight) return;
-      const time = jump ? 1 : clamped((now - begin) / FLIGHT_MILLISECONDS, 0, 1);
-      this.eye = this.between(from, to, time * time * (3 - 2 * time));
-      this.draw();
-      if (time < 1) requestAnimationFrame(step);
-    };
-    requestAnimationFrame(step);
+    if (!wantsLessMotion()) this.flight = { from, begin: performance.now() };
+    this.requestDraw();
+  }
+
+  // The eye, or where it is on its way there.
+  eyeInFlight() {
+    if (!this.flight) return this.eye;
+    const { from, begin } = this.flight;
+    const time = clamped((performance.now() - begin) / FLIGHT_MILLISECONDS, 0, 1);
+    if (time === 1) this.flight = null;
+    return this.between(from, this.eye, time * time * (3 - 2 * time));
   }
 
   // The eye on the way between two others; `share` is 0 at the first and 1 at the second.
@@ -157,7 +157,7 @@ class Viewer {
   // the system asks for less motion, it shows one picture after the other instead.
   flyTour(secondsPerRound) {
     const { poses } = this.scene.tour;
-    const begin = { ...this.eye, distance: this.usualDistance };
+    const begin = { ...this.eyeInFlight(), distance: this.usualDistance };
     const distances = poses.map(({ position }) => Math.hypot(...add(position, begin.position, -1)));
     const start = distances.indexOf(Math.min(...distances));
     const still = wantsLessMotion() ? Math.ceil(TOUR_STILL_SECONDS * poses.length / secondsPerRound) : 0;
@@ -167,7 +167,7 @@ class Viewer {
       isVisible = entries[entries.length - 1].isIntersecting;
     });
     observer.observe(this.canvas);
-    this.flight++;
+    this.flight = null;
     this.mark(null);
     this.tour = tour;
     const pose = (index) => ({ ...begin, ...poses[(start + index) % poses.length] });
@@ -208,7 +208,6 @@ class Viewer {
   }
 
   change(values) {
-    this.flight++;
     this.endTour();
     this.mark(null);
     this.eye = { ...this.eye, ...values };
@@ -267,12 +266,24 @@ class Viewer {
     return { ...eye, rotation: rows, position: add(target(eye), rows[2], -distance) };
   }
 
-  // Multiplies the distance to the target.
+  // Multiplies the distance to the target; the eye stays before the surface ahead.
   zoom(factor) {
-    const distance = clamped(
-      this.eye.distance * factor, MIN_ZOOM * this.usualDistance, MAX_ZOOM * this.usualDistance,
-    );
-    this.change({ distance, position: add(target(this.eye), this.eye.rotation[2], -distance) });
+    if (this.measured !== this.eye) this.surface = this.surfaceAhead();
+    const nearest = this.usualDistance - (1 - NEAREST) * this.surface;
+    this.change(this.atDistance(clamped(this.eye.distance * factor, nearest, FARTHEST * this.usualDistance)));
+    this.measured = this.eye;  // it moves along its axis only
+  }
+
+  // The eye at another distance to its target.
+  atDistance(distance) {
+    return { ...this.eye, distance, position: add(target(this.eye), this.eye.rotation[2], -distance) };
+  }
+
+  // The distance to the surface on the axis of the eye, from the usual distance to the target, or the latter if less.
+  surfaceAhead() {
+    const eye = this.withNearPlane(this.atDistance(this.usualDistance));
+    const view = this.viewOf(eye);
+    return Math.min(this.renderer.medianDepth(eye, view, view.centre) ?? Infinity, this.usualDistance);
   }
 
   // Moves the eye sideways so that its target follows the pointer, by pixels of the page.
@@ -286,6 +297,7 @@ class Viewer {
   // Turns all pictures clockwise by a quarter, where photos lie on their side: right, down = -down, right.
   rollQuarter() {
     const { scene } = this;
+    this.flight = null;  // it would begin at pictures that are not turned
     const turnedFrame = ([right, down, forward]) => [down.map((value) => -value), right, forward];
     const turned = ({ rotation, size: [width, height], focal: [fx, fy], centre: [cx, cy], ...rest }) => ({
       ...rest, rotation: turnedFrame(rotation), size: [height, width], focal: [fy, fx], centre: [height - 1 - cy, cx],
@@ -328,12 +340,14 @@ class Viewer {
     };
   }
 
-  // An eye with its near plane: that of the fit at a photo's camera, farther away beside it.
+  // An eye with its near plane: that of the fit at a photo's camera, farther away beside it, and as
+  // much nearer as the surface ahead where it zooms in.
   withNearPlane(eye) {
     const { nearPlane, farNearPlane } = this.renderer.settings;
     const distances = this.scene.cameras.map(({ position }) => Math.hypot(...add(position, eye.position, -1)));
     const share = clamped(Math.min(...distances) / (NEAR_CAMERA * eye.distance), 0, 1);
-    return { ...eye, nearPlane: nearPlane + share * (farNearPlane - nearPlane) };
+    const zoomed = clamped(1 - (this.usualDistance - eye.distance) / this.surface, 0, 1);
+    return { ...eye, nearPlane: nearPlane + zoomed * share * (farNearPlane - nearPlane) };
   }
 
   // Draws with the next frame of the browser, once.
@@ -347,12 +361,14 @@ class Viewer {
   }
 
   draw() {
-    const { eye } = this;
+    const eye = this.eyeInFlight();
+    this.drawn = eye;
     this.view = this.viewOf(eye);
     this.renderer.resize(...this.view.sides);
     this.renderer.draw(this.withNearPlane(eye), this.view);
     this.drawPyramids();
     this.ruler.draw();
+    if (this.flight) this.requestDraw();
   }
 
   // -- The pyramids that mark the cameras.
@@ -395,8 +411,8 @@ class Viewer {
 
   // A point of the world in the axes of the eye.
   seen(point) {
-    const relative = add(point, this.eye.position, -1);
-    return this.eye.rotation.map((row) => dot(row, relative));
+    const relative = add(point, this.drawn.position, -1);
+    return this.drawn.rotation.map((row) => dot(row, relative));
   }
 
   // A point in the axes of the eye as "x y" in pixels of the page.
@@ -411,9 +427,9 @@ class Viewer {
   pointAt(clientX, clientY) {
     const { left, top } = this.canvas.getBoundingClientRect();
     const { ratio, focal, centre } = this.view;
-    const { rotation: [right, down, forward], position } = this.eye;
+    const { rotation: [right, down, forward], position } = this.drawn;
     const pixel = [clientX - left, clientY - top].map((value) => ratio * value - 0.5);  // integer pixel centres
-    const depth = this.renderer.medianDepth(this.withNearPlane(this.eye), this.view, pixel);
+    const depth = this.renderer.medianDepth(this.withNearPlane(this.drawn), this.view, pixel);
     if (depth === null) return null;
     const [x, y] = pixel.map((value, axis) => depth * (value - centre[axis]) / focal[axis]);
     return add(add(add(position, right, x), down, y), forward, depth);

@@ -3,6 +3,7 @@
 import base64
 import hashlib
 import json
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from importlib import resources
@@ -27,6 +28,7 @@ _PICTURE_BYTES = 3_000_000  # of all photos, renders and differences
 _THUMBNAIL_BYTES = 100_000  # of all thumbnails
 _LAYOUT_BYTES = 8192  # reserved for the layout of the splat and for sizes in the text
 _NUMBERS = ("One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine", "Ten", "Eleven", "Twelve")
+_OPTION = re.compile(r"--[a-z][a-z-]*")  # of a command, in a sentence
 _LISTED = 24  # photos whose file names are under Details
 _STYLES = ("style.css", "viewer.css")
 _SCRIPTS = ("renderer.js", "ruler.js", "viewer.js", "pictures.js")
@@ -80,6 +82,7 @@ class _Page:
             content.photos.parts,
             content.splat.gaussians.means,
             psnr_of_views(runs[-1]) if runs else {},
+            content.photos.path,
         )
         offset = content.splat.offset
         self._scene = scene | {"offset": [0.0, 0.0, 0.0] if offset is None else offset.tolist()}
@@ -100,6 +103,7 @@ class _Page:
             self._context |= {kind: Markup(text), f"{kind}_hash": f"sha256-{digest}"}
         loader = jinja2.PackageLoader("kgs.app.page", ".")
         environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True)
+        environment.filters["options_whole"] = _options_whole
         self._template = environment.get_template("page.html.jinja")
 
     def html(self, packed: Packed | None = None, page_bytes: int = 0) -> bytes:
@@ -129,13 +133,11 @@ def _context(content: PageContent, scene: Mapping[str, Any]) -> dict[str, Any]:
     photos = content.photos
     text = content.text
     cameras = scene["cameras"]
-    count = len(cameras)
-    number = _NUMBERS[count - 1] if count <= len(_NUMBERS) else str(count)
     first_run = next(iter(text.runs.values()), {})
     measures_head, measures = measure_table(text.runs)
     return {
         "title": text.title,
-        "lead": f"{number} photo{'s' if count > 1 else ''}. Drag to look around.",
+        "lead": f"{_counted([camera['part'] == 'test' for camera in cameras])} Drag to look around.",
         "strip": _strip(photos, cameras),
         "has_photos": bool(photos.pictures or photos.thumbnails),
         "version": __version__,
@@ -156,6 +158,21 @@ def _context(content: PageContent, scene: Mapping[str, Any]) -> dict[str, Any]:
         "versions": facts(first_run.get("versions") or {"kgs": __version__}),
         "files": {name: Markup(_file(name)) for name in _SHADERS},
     }
+
+
+def _counted(held_out: Sequence[bool]) -> str:
+    """How many photos there are, and how many more were held out, if they are not all."""
+    more = sum(held_out) % len(held_out)
+    used = len(held_out) - more
+    number, other = (_NUMBERS[count - 1] if 0 < count <= len(_NUMBERS) else str(count) for count in (used, more))
+    return f"{number} photo{'s' if used > 1 else ''}{f', {other.lower()} more held out' if more else ''}."
+
+
+def _options_whole(text: str) -> str:
+    """A sentence as HTML, in which no line ends inside an option of a command."""
+    from markupsafe import Markup, escape
+
+    return Markup(_OPTION.sub(r'<span class="option">\g<0></span>', str(escape(text))))
 
 
 def _file(name: str) -> str:

@@ -3,10 +3,10 @@
 A low reprojection error proves nothing: a few matches fit wrong cameras as well. So two solvers, which use other
 keypoints, each find the cameras. *Consensus*: both register a photo, and agree about its rotation and its lens.
 *Retry*: before a photo is rejected, the solvers that failed about it try again. *Rejected photos*: those that show
-another place, or the same as another photo from the same place, and those without consensus or with few points; at
-least three remain. *Acceptance checks*: of the others the focal length has to be in the range of real lenses, and
-determined by the photos or their Exif; each photo has to see many points; and the solvers have to agree. Else all
-photos are refused, and the user is told what to photograph next.
+another place, or the same as another photo from the same place, those without consensus or with few points, and the
+smaller of two groups between which something was moved; at least three remain. *Acceptance checks*: of the others the
+focal length has to be in the range of real lenses, and determined by the photos or their Exif; each photo has to see
+many points; and the solvers have to agree. Else all photos are refused, and the user is told what to photograph next.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
@@ -25,6 +25,7 @@ from kgs.geometry.rigs import degrees_between
 from .find import MIN_PHOTOS
 from .map import Cameras, Solver
 from .match import colmap_matching, lenses_of, write_matches
+from .moved import moved_photos
 from .pairs import (
     FEWER,
     MIN_MATCHES,
@@ -53,13 +54,13 @@ _MAX_TRIES = 4
 _REGISTRATIONS = 48  # of photos in all tries together, if that leaves as many tries: each registers all photos
 _UNTOLD = "the photos do not tell the focal length, and their Exif does not say it"
 _FORWARD = (
-    "The camera moved along its view, as when walking forward: what lies ahead hardly moves between such photos, and "
-    "nothing tells how far away it is. What helps most: step sideways, not forward, so that neighbours are 3 to 20 "
-    f"degrees apart.\n{FEWER}"
+    "The camera moved along its view: what lies ahead hardly moves between such photos, which hides its depth.\n"
+    f"What helps: step sideways, not forward, so that neighbours are 3 to 20 degrees apart.\n{FEWER}"
 )
 _APART = (
-    "As a rule they are too close together. What helps: larger steps to the side or up, so that neighbours are 3 to 20 "
-    "degrees apart; or the photos as the camera wrote them, since messengers and many editors drop Exif"
+    "As a rule they are too close together.\n"
+    "What helps: larger steps to the side or up, so that neighbours are 3 to 20 degrees apart.\n"
+    "Or the photos as the camera wrote them: messengers and many editors drop Exif"
 )
 
 Solutions = tuple[Cameras, Cameras]  # what the two solvers found
@@ -110,7 +111,7 @@ def accepted_cameras(
         known = [lens.focal_length for lens in lenses] if are_known else []
         consensus = Consensus((first, second), second_matches, executor, known, pairs)
         solutions, held = consensus.solve(kept)
-        while more := without_cameras(solutions, list(kept.values()), pairs):
+        while more := without_cameras(solutions, list(kept.values()), pairs) or moved_between(solutions, kept):
             rejected |= more
             kept = {image: name for image, name in kept.items() if name not in rejected}
             solutions, held = consensus.solve(kept)
@@ -234,6 +235,21 @@ def without_cameras(solutions: Solutions, names: Sequence[str], pairs: Pairs) ->
     return left if len(names) - len(left) >= MIN_PHOTOS else {}
 
 
+def moved_between(solutions: Solutions, names: Mapping[str, str]) -> dict[str, str]:
+    """Photos that one flat thing alone joins to a larger group of at least `MIN_PHOTOS`, and why they are left out.
+
+    Args:
+        solutions: what the two solvers found.
+        names: those of the photos, by those of their images.
+    """
+    found = [moved_photos(cameras.reconstruction) for cameras in solutions if cameras.points]
+    images = next(filter(None, found), [])
+    if len(names) - len(images) < MIN_PHOTOS:
+        return {}
+    why = "only one flat thing joins it to the other group of photos: was that moved, or is this another place?"
+    return {names[image]: why for image in images}
+
+
 def doubtful(solutions: Solutions, names: Sequence[str], pairs: Pairs) -> set[str]:
     """Photos whose cameras cannot be trusted, also where too few others remain."""
     left = _registered_badly(*solutions, names, pairs)
@@ -308,9 +324,9 @@ def check(
     registered = [name for name in names if name not in missing]
     between = gap(missing[0], registered, pairs) if missing and registered else weakest_link(names, pairs)
     beside = (
-        f"What helps most: photos from places between {' and '.join(between)}, with steps to the side or up (turning "
-        "on the spot shows no depth), so that neighbours share two thirds of the scene; a scene with texture; all with "
-        f"one lens, without zoom.\n{FEWER}"
+        f"What helps: photos from places between {' and '.join(between)}, with steps to the side or up.\n"
+        "Neighbours share two thirds of the scene, which has texture; all with one lens, without zoom.\n"
+        f"{FEWER}"
     )
     reasons = [objections(cameras, names, longest) for cameras in solutions]
     good = [i for i, objection in enumerate(reasons) if not objection]

@@ -25,11 +25,10 @@ if TYPE_CHECKING:
 
 MIN_PHOTOS = 3
 MAX_FRAMES = 36  # of a video, where twelve would be too far apart
-_LISTED = 10
 CONVERT = (
-    'kgs reads PNG, JPEG, WebP, TIFF and BMP, and HEIC with its extra (pip install -e ".[heic]"). Or make JPEGs: on a '
-    "Mac `sips -s format jpeg *.HEIC --out jpeg`, elsewhere `magick mogrify -format jpg *.HEIC` (ImageMagick) or "
-    "`heif-convert` (libheif); on an iPhone Settings > Camera > Formats > Most Compatible takes JPEGs from the start"
+    'kgs reads PNG, JPEG, WebP, TIFF and BMP, and HEIC with its extra: pip install ".[heic]"\n'
+    "Or make JPEGs: `sips -s format jpeg *.HEIC --out jpeg` on a Mac, else `magick mogrify -format jpg *.HEIC`\n"
+    "An iPhone takes JPEGs from the start: Settings > Camera > Formats > Most Compatible"
 )
 ADVICE = "Take 3 to 12 photos of one scene that does not move, a small step between them, so that neighbours overlap"
 
@@ -84,7 +83,7 @@ def _is_video(path: Path) -> bool:
 
 def notes_on(folder: Path, photos: Sequence[Path], masks: "MaskFiles") -> list[str]:
     """What a folder of photos holds that is not used, a sentence each."""
-    notes = [*folders.unused_files(folder), *_nameless(folder), *masks.notes(folder, _LISTED)]
+    notes = [*folders.unused_files(folder), *_nameless(folder), *masks.notes(folder)]
     used = [path.resolve() for path in (*masks.masks.values(), *masks.unused)]
     inner = [path for path in sorted(folder.iterdir()) if path.is_dir()]
     inner = [path for path in inner if not any(file.is_relative_to(path.resolve()) for file in used)]
@@ -122,8 +121,8 @@ def _readable() -> tuple[str, ...]:
 
 
 def listed_files(paths: list[Path]) -> str:
-    """The names of files, the first ten of them."""
-    return listed([path.name for path in paths], _LISTED)
+    """The names of files, the first of them."""
+    return listed([path.name for path in paths])
 
 
 def _holds_photos(folder: Path) -> bool:

@@ -100,8 +100,9 @@ def why_no_cameras(names: Sequence[str], pairs: Pairs, geometries: Mapping[tuple
     if twins := [pair for pair, geometry in geometries.items() if geometry.shift < _MIN_SHIFT]:
         one, other = twins[0]
         return (
-            f"{one} and {other} match at the same pixels: either they show the same from the same place, so remove one "
-            "of them; or they carry the same watermark, caption or frame, so crop it from all photos"
+            f"{one} and {other} match at the same pixels.\n"
+            "If they show the same from the same place, remove one of them.\n"
+            "If they carry the same watermark, caption or frame, crop it from all photos"
         )
     groups = groups_of(names, pairs)
     if len(groups) == 1 and min(geometry.planar for geometry in geometries.values()) < _PLANAR:
@@ -117,7 +118,7 @@ def why_no_cameras(names: Sequence[str], pairs: Pairs, geometries: Mapping[tuple
         reason = f"the photos fall into {len(groups)} groups that do not overlap ({listed})"
         between = f"take photos from places between {' and '.join(weakest_link(names, pairs))}"
         advice = f"If they show two scenes, keep one group in the folder; if they show one, {between}"
-    return f"{reason}.\n{advice}. {FEWER}.\n{table(names, pairs)}"
+    return f"{reason}.\n{advice}.\n{FEWER}.\n{table(names, pairs)}"
 
 
 def went_forward(geometries: Mapping[tuple[str, str], PairGeometry]) -> bool:

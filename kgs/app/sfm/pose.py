@@ -13,7 +13,7 @@ from typing import Any
 
 import cv2
 
-from kgs._support.errors import DataError, printable
+from kgs._support.errors import DataError, listed, printable
 from kgs._support.json_files import read_json, write_json
 from kgs._support.machine import versions
 from kgs._support.progress import ProgressBar, silent
@@ -257,7 +257,7 @@ def _say_notes(opened: list[OpenPhoto], photos: list[Photo], unsharp: list[str],
     for note in color_notes([photo.image for photo in opened]):
         say(note)
     if odd := [photo.name for photo in opened if photo.has_odd_focal]:
-        say(f"a focal length in the Exif that no lens has is passed over: {', '.join(odd)}")
+        say(f"a focal length in the Exif that no lens has is passed over: {listed(odd)}")
     if unsharp:
         say(f"blurred beside the others: {', '.join(unsharp)}; if the fit shows it, take them again")
 

@@ -73,8 +73,6 @@ def take_frames(
     with _Reader(video) as reader:
         for index in bar(indices, "frames", "frame"):
             pixels = reader.read(index)
-            if pixels is None:
-                raise DataError(video, "", f"frame {index} a second time", "none")
             paths.append(folder / f"frame_{index:05d}.png")
             write_png(paths[-1], torch.from_numpy(pixels[..., ::-1].copy()).permute(2, 0, 1))
     say(f"{video.name}: {len(paths)} frames, {way / (len(paths) - 1):.0f} degrees apart in the mean")
@@ -86,11 +84,9 @@ def _look(video: Path, bar: ProgressBar) -> list[_Frame]:
     frames = list[_Frame]()
     with _Reader(video) as reader:
         motion = _Motion()
-        every = max(1, reader.count // _LOOKED_AT)
-        for index in bar(range(0, reader.count, every), "video", "frame"):
+        count = reader.count()
+        for index in bar(range(0, count, max(1, count // _LOOKED_AT)), "video", "frame"):
             pixels = reader.read(index)
-            if pixels is None:
-                break
             scale = min(1.0, _LONGEST / max(pixels.shape))
             full = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
             resized = cv2.resize(full, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -161,13 +157,9 @@ class _Reader:
         if path is None:
             raise DataError(video, "", "a video that OpenCV can open", advice=f"{NOT_UTF8}")
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # else FFmpeg writes of damage to stderr
-        self._capture = cv2.VideoCapture(str(path))
+        self._path = str(path)
+        self._capture = cv2.VideoCapture(self._path)
         self._next = 0
-        self.count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        if self.count <= 0:  # the header of a recorder that writes as it goes has none
-            self.count = sum(1 for _ in iter(self._capture.grab, False))
-            self._capture.release()
-            self._capture = cv2.VideoCapture(str(path))
         self._pixel_width = self._aspect()  # over its height
 
     def _aspect(self) -> float:
@@ -184,18 +176,22 @@ class _Reader:
     def __exit__(self, *_: object) -> None:
         self._capture.release()
 
-    def read(self, index: int) -> NDArray[np.uint8] | None:
-        """A frame, `(H, W, 3)` BGR, behind the last one that was read, or None behind the end.
+    def count(self) -> int:
+        """The number of frames that are decoded: headers guess it from a rate and a duration. Begins again."""
+        count = sum(1 for _ in iter(self._capture.grab, False))
+        self._capture.release()
+        self._capture = cv2.VideoCapture(self._path)
+        self._next = 0
+        return count
 
-        It is never made smaller to have square pixels.
-        """
+    def read(self, index: int) -> NDArray[np.uint8]:
+        """A frame, `(H, W, 3)` BGR, behind the last one that was read; never made smaller to have square pixels."""
         while self._next <= index:
-            if not self._capture.grab():
-                return None
+            self._capture.grab()
             self._next += 1
         done, pixels = self._capture.retrieve()
         if not done:
-            return None
+            raise DataError(self._path, "", f"frame {index} again", "none")
         height, width = pixels.shape[:2]
         size = round(width * max(self._pixel_width, 1.0)), round(height / min(self._pixel_width, 1.0))
         if size == (width, height):

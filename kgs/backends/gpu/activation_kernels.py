@@ -39,7 +39,7 @@ def activate(
         i = k * BLOCK + lane
         inside = i < left * 3
         x = tl.load(log_scales + first * 3 + i, mask=inside, other=0.0)
-        tl.store(scales + first * 3 + i, tl.where(x >= _LARGEST_LOG, float("inf"), _exp(x)), mask=inside)
+        tl.store(scales + first * 3 + i, tl.where(x < _LARGEST_LOG, _exp(x), float("inf")), mask=inside)
     logit = tl.load(opacity_logits + first + lane, mask=lane < left, other=0.0)
     tl.store(opacities + first + lane, 1.0 / (1.0 + _exp(-logit)), mask=lane < left)
     if BANDS > 0:
@@ -67,11 +67,11 @@ def activation_gradients(
             inside = i < left * 3
             scale = tl.load(scales + first * 3 + i, mask=inside, other=0.0)
             slope = tl.load(g_scales + first * 3 + i, mask=inside, other=0.0) * scale
-            tl.store(d_log_scales + first * 3 + i, tl.where(scale == float("inf"), 0.0, slope), mask=inside)
+            tl.store(d_log_scales + first * 3 + i, tl.where(scale < float("inf"), slope, 0.0), mask=inside)
     if WITH_OPACITIES:
         opacity = tl.load(opacities + first + lane, mask=lane < left, other=0.0)
         slope = tl.load(g_opacities + first + lane, mask=lane < left, other=0.0) * (1.0 - opacity) * opacity
-        tl.store(d_opacity_logits + first + lane, slope, mask=lane < left)
+        tl.store(d_opacity_logits + first + lane, tl.where(opacity == opacity, slope, 0.0), mask=lane < left)
     if BANDS > 0:
         for k in tl.static_range(3):
             i = k * BLOCK + lane

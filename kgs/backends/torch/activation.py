@@ -1,6 +1,7 @@
 """The activations in torch: exponential for scales, sigmoid for opacities, and the active bands of harmonics joined."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -17,13 +18,16 @@ def activate(
     colors: Tensor = sh_dc
     if bands > 1:
         colors = _JoinedBands.apply(sh_dc, sh_rest, bands)
-    # The gradient of exp would be 0 times infinity where it overflows.
-    too_large = log_scales >= math.log(torch.finfo(log_scales.dtype).max)
-    if log_scales.device.type == "cpu" and not torch.compiler.is_compiling() and not bool(too_large.any()):
-        scales = log_scales.exp()
-    else:  # on a GPU the answer would be waited for
-        scales = log_scales.masked_fill(too_large, 0.0).exp().masked_fill(too_large, math.inf)
-    return scales, opacity_logits.sigmoid(), colors
+    scales = _or_constant(torch.exp, log_scales, log_scales < math.log(torch.finfo(log_scales.dtype).max), math.inf)
+    opacities = _or_constant(torch.sigmoid, opacity_logits, ~opacity_logits.isnan(), math.nan)
+    return scales, opacities, colors
+
+
+def _or_constant(function: Callable[[Tensor], Tensor], x: Tensor, valid: Tensor, constant: float) -> Tensor:
+    """A function where its argument is valid, elsewhere a constant: its gradient would be 0 times infinity, or NaN."""
+    if x.device.type == "cpu" and not torch.compiler.is_compiling() and bool(valid.all()):
+        return function(x)  # on a GPU the answer would be waited for
+    return function(x.where(valid, 0.0)).where(valid, constant)
 
 
 class _JoinedBands(torch.autograd.Function):

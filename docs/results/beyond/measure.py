@@ -2,23 +2,27 @@
 
 Of the synthetic room the truth is known everywhere: cameras 1, 2 and 3 times as far from the middle of the training
 cameras as these, over the pixels whose surface a training view shows. Of real scenes the outermost photos are held out
-and the most central ones are trained on.
+and the most central ones are trained on. `python measure.py --out OUT`, in minutes; with SCENES of KGS_DATA the real
+ones too, in half an hour.
 """
 
-from collections.abc import Callable, Sequence
+import os
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import product
 from math import ceil, inf
 from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
 
+import pandas as pd
 import torch
+import tyro
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from kgs._support.errors import DataError
+from kgs.bench.output import mean_sd
 from kgs.bench.scenes import check_scenes
 from kgs.datasets import load_scene, synthetic_scene
 from kgs.datasets.border import with_border
@@ -29,10 +33,11 @@ from kgs.geometry.rigs import camera_centers
 from kgs.metrics.coverage import views_that_show
 from kgs.metrics.evaluate import masked_psnr
 from kgs.metrics.lpips import Lpips
-
-from .cells import fit_and_measure, fit_config, load_lpips
-from .grid import Cell
-from .presets import AUTO
+from kgs.study.cells import fit_and_measure, fit_config, load_lpips
+from kgs.study.grid import Cell, run_grid
+from kgs.study.pairs import frame_of, grouped
+from kgs.study.presets import AUTO, name_of
+from kgs.study.texts import counts, document, table_of
 
 ROOM, ROOM_VIEWS = "room", 3  # the synthetic scene and its training views
 PHOTOS = {"llff/fern": 3, "colmap/trex": 3, "nerfstudio/fox": 12}  # the real scenes and theirs
@@ -40,6 +45,29 @@ OUT = (1, 2, 3)  # distances from the middle of the training cameras, over their
 SIZE = (189, 252)  # pixels of the room's views, height and width
 CAMERAS = 6  # at each of these distances
 OUTER = 0.25  # share of a real scene's photos that are held out
+_NOTES = (
+    "Mean (sd) over n seeds; PSNR in dB; LPIPS with VGG16, inputs in [0, 1]; seconds of wall time of a fit.",
+    f"Synthetic: {CAMERAS} cameras on an ellipse around the middle of the training cameras, 1, 2 and 3 times as far "
+    "out as these; all look at the middle of the scene. A pixel counts if a training view shows its surface: the point "
+    "at its exact depth lies in that image, no farther than 1.05 times the exact depth of the nearest pixel there. For "
+    "LPIPS the other pixels are the truth's. Share: of the pixels that count, at 1, 2 and 3. Inside: the test views, "
+    "all pixels.",
+    "Real: views are ordered by the distance of the camera's centre from the mean of all centres; the first ones are "
+    f"trained on, the last {OUTER:.0%} of all photos are the outer views, all pixels. Seen: PSNR where, by the fit's "
+    "own depth, two training views show the surface, and the share of these pixels.",
+)
+# What a table has of a scene: the columns of PSNR, or of a share, and of LPIPS.
+_TEST = ("test.psnr", "test.lpips_vgg_unscaled")
+_SYNTHETIC = {"inside": _TEST} | {f"{out} times out": (f"beyond.{out}.psnr", f"beyond.{out}.lpips") for out in OUT}
+_REAL = {
+    "outer views": _TEST,
+    "seen": ("seen.psnr", None),
+    "share": ("seen.share", None),
+    "training views": ("train.psnr", "train.lpips_vgg_unscaled"),
+}
+_SHARES = [f"beyond.{out}.share" for out in OUT]
+_NUMBERS = [column for columns in (*_SYNTHETIC.values(), *_REAL.values()) for column in columns if column is not None]
+_NUMBERS = [*dict.fromkeys(_NUMBERS), *_SHARES, "gaussians", "wall_seconds"]
 
 
 class Target(NamedTuple):
@@ -50,10 +78,7 @@ class Target(NamedTuple):
 
 
 def beyond_cells(data: Path | None) -> list[Cell]:
-    """The cells of the preset: three seeds of the room, then, with a folder `data`, of the real ones.
-
-    DataError: `data` lacks a scene.
-    """
+    """The cells: three seeds of the room, then, with a folder `data`, of the real ones."""
     if data is not None:
         check_scenes(data, PHOTOS)
     parts = [({ROOM: ROOM_VIEWS}, None, 500), ({} if data is None else PHOTOS, 2.0, 1000)]
@@ -71,7 +96,7 @@ def beyond_cell(cell: Cell, data: str | None = None, lpips_weights: str | None =
     Args:
         cell: "scene" (`ROOM`, or a folder below `data`), "views", "downscale", "method" (a name, for the report),
             "seed", and "fit": the fields of FitConfig that are not those of the default.
-        data: the folder of the real scenes; DataError: the scene is not there or damaged.
+        data: the folder of the real scenes.
         lpips_weights: a folder with the weights of VGG16 and LPIPS, or None to leave LPIPS out.
 
     Returns:
@@ -82,7 +107,7 @@ def beyond_cell(cell: Cell, data: str | None = None, lpips_weights: str | None =
     scene = _scene(cell["scene"], cell["views"], cell["downscale"], data)
     points = choose_points(scene, config)
     lpips = load_lpips(lpips_weights)
-    _, fit, stored = fit_and_measure(scene, config, points, lpips)
+    _, fit, stored = fit_and_measure(scene, config, points, lpips, name=name_of(cell))
     targets = room_targets(scene) if cell["scene"] == ROOM else {}
     stored["beyond"] = {str(out): measure_target(fit.render, target, lpips) for out, target in targets.items()}
     return stored
@@ -157,6 +182,56 @@ def from_the_middle(scene: Scene, count: int) -> Scene:
 def _scene(name: str, views: int, downscale: float | None, data: str | None) -> Scene:
     if name == ROOM:
         return synthetic_scene(views, CAMERAS, SIZE)
-    if data is None:
-        raise DataError(name, "", "the environment variable KGS_DATA to name the folder of this scene")
-    return from_the_middle(load_scene(Path(data) / name, downscale=downscale, hold_out=0), views)
+    return from_the_middle(load_scene(Path(data or "") / name, downscale=downscale, hold_out=0), views)
+
+
+def write_beyond(rows: Sequence[Mapping[str, Any]], out: Path) -> str:
+    """Write beyond.md, and return what it holds."""
+    frame = frame_of(rows, _NUMBERS).astype(dict.fromkeys(_NUMBERS, float))
+    commits = counts(row["result"].get("revision") or "of no known commit" for row in rows)
+    is_room = frame.scene == ROOM
+    tables = {"Synthetic scene": _table(frame[is_room], _SYNTHETIC), "Real scenes": _table(frame[~is_room], _REAL)}
+    shown = {title: table for title, table in tables.items() if len(table)}
+    text = document("Beyond the photos", [f"{len(rows)} cells; by commit of kgs: {commits}.", *_NOTES], shown)
+    (out / "beyond.md").write_text(text.rstrip() + "\n", encoding="utf-8")
+    return text
+
+
+def _table(frame: pd.DataFrame, heads: Mapping[str, tuple[str, str | None]]) -> pd.DataFrame:
+    """A line of text for each scene, number of views and method."""
+    lines = []
+    for (scene, views, method), cells in grouped(frame, "scene", "views", "method"):
+        line = {"scene": f"{scene}, {views} views", "method": method, "n": str(len(cells))}
+        for head, (psnr, lpips) in heads.items():
+            line[head] = mean_sd(cells[psnr], 2)
+            if lpips is not None and cells[lpips].count():
+                line[head] += f"; {mean_sd(cells[lpips], 3)}"
+        if scene == ROOM:
+            line["share"] = ", ".join(f"{share:.2f}" for share in cells[_SHARES].iloc[0])
+        line["Gaussians"] = mean_sd(cells.gaussians, 0)
+        line["seconds"] = mean_sd(cells.wall_seconds, 0)
+        lines.append(line)
+    return table_of(lines)
+
+
+def main(*, out: Path, lpips_weights: Path | None = None, processes: int | None = None) -> int:
+    """Fit and measure what beyond.jsonl does not have yet, and write beyond.md.
+
+    Args:
+        out: folder for the results.
+        lpips_weights: folder with VGG16 and LPIPS weights; without it LPIPS is left out.
+        processes: fits at a time, one per core unless given.
+    """
+    data = os.environ.get("KGS_DATA")
+    cells = beyond_cells(None if data is None else Path(data))
+    work = partial(
+        beyond_cell, data=data, lpips_weights=None if lpips_weights is None else str(lpips_weights.resolve())
+    )
+    rows = run_grid(cells, work, out / "beyond.jsonl", processes=processes, name=name_of)
+    if rows:
+        print(write_beyond(rows, out))
+    return int(len(rows) < len(cells))
+
+
+if __name__ == "__main__":
+    raise SystemExit(tyro.cli(main))
