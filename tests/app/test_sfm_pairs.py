@@ -64,6 +64,7 @@ def test_why_matches_give_no_cameras(geometries, pairs, said):
 
 def test_groups_links_and_the_table():
     assert groups_of(NAMES[:3], PAIRS) == [["a", "b", "c"]]
+    assert groups_of(NAMES[:3], PAIRS | {("left", "out"): 500}) == [["a", "b", "c"]]
     assert groups_of(NAMES[:3], PAIRS | {("a", "c"): 29, ("b", "c"): 29}) == [["a", "b"], ["c"]]
     assert weakest_link(NAMES[:3], PAIRS) == ("b", "c")
     assert weakest_link(NAMES[:3], PAIRS | {("a", "left out"): 300}) == ("b", "c")

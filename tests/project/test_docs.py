@@ -35,11 +35,7 @@ def test_every_public_name_has_a_place_among_the_api_pages():
 
 def python_of(path):
     """The Python that a page shows, in its blocks; `py` marks lines for the code of other projects."""
-    blocks = re.findall(r"^```python\n(.*?)^```", path.read_text(encoding="utf-8"), re.M | re.S)
-    if path.name == "README.md":  # its readers see the file itself
-        return blocks
-    names = [re.fullmatch(r'--8<-- "(snippets/\w+\.py)"\n', block)[1] for block in blocks]
-    return [(ROOT / "docs" / name).read_text(encoding="utf-8") for name in names]
+    return re.findall(r"^```python\n(.*?)^```", path.read_text(encoding="utf-8"), re.M | re.S)
 
 
 def test_the_python_of_the_pages_is_that_of_the_snippets():

@@ -29,7 +29,9 @@ def render(
 ) -> None:
     """Render a splat from every camera of a scene into PNGs.
 
-    A splat that its file calls antialiased is rendered so. If no camera sees the splat, nothing is written.
+    They have the size of the scene's photos, unless --downscale is given, and no distortion of a lens: the photos of
+    the fit itself, beside which its page shows them, may be smaller and were undistorted. A splat that its file calls
+    antialiased is rendered so. If no camera sees the splat, nothing is written.
 
     For example:
       kgs render fern-3 -o renders

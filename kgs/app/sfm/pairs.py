@@ -133,10 +133,13 @@ def count(pairs: Pairs, one: str, other: str) -> int:
 
 
 def groups_of(names: Sequence[str], pairs: Pairs) -> list[list[str]]:
-    """Groups of photos that overlapping pairs connect, the largest first, each in the order of `names`."""
+    """Groups of photos that overlapping pairs connect, the largest first, each in the order of `names`.
+
+    `pairs` may have photos besides those in `names`.
+    """
     groups = [{name} for name in names]
     for pair, matches in pairs.items():
-        if matches >= MIN_MATCHES:
+        if matches >= MIN_MATCHES and set(pair) <= set(names):
             joined = [group for group in groups if group & set(pair)]
             groups = [group for group in groups if group not in joined] + [set().union(*joined)]
     return sorted((sorted(group, key=list(names).index) for group in groups), key=lambda g: (-len(g), g))
