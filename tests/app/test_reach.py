@@ -47,6 +47,16 @@ def test_a_camera_whose_image_one_photo_shows_moves_to_where_two_show_it() -> No
     assert 0.4 + 0.1 * 4 - 1.6 / 8 < centers[2, 0] < 0.4 + 0.1 * 4 + 0.1  # steps, and pixels of the small image
 
 
+def test_a_camera_that_looks_the_other_way_is_left_for_the_nearest_that_shows_enough() -> None:
+    """The path between them would lead through the scene, or through a point where a camera has no direction."""
+    fit = fit_of(0.0, 0.4, 0.5)
+    poses = fit.scene.train.cameras.extrinsics.clone()
+    poses[2] = torch.diag(torch.tensor([-1.0, 1, -1, 1])) @ poses[2]  # sees nothing
+    train = replace(fit.scene.train, cameras=kgs.cameras.posed(fit.scene.train.cameras, poses))
+    views, _ = film_views(Fit(replace(fit.scene, train=train), fit.model, fit.options))
+    torch.testing.assert_close(views.cameras.extrinsics[2], poses[1])
+
+
 @pytest.mark.parametrize("positions", [(0.0,), (0.0, 9.0), (0.0, 0.1, 0.2)], ids=["one", "apart", "near"])
 def test_without_a_better_one_all_stay(positions: tuple[float, ...]) -> None:
     fit = fit_of(*positions)

@@ -10,6 +10,7 @@ from kgs.datasets.scene import Views
 from kgs.datasets.splits import select_evenly
 from kgs.fit.fit import Fit
 from kgs.geometry.cameras import image_size, posed, resized, select, to
+from kgs.geometry.rigs import camera_centers
 from kgs.metrics.coverage import MIN_VIEWS, views_that_show
 
 from .cameras import rolled, shown_poses
@@ -25,7 +26,8 @@ def film_views(fit: Fit, roll: float = 0.0) -> tuple[Views, int]:
     """The training views from where the film and the page's viewer pass them, and the index of the best.
 
     The best camera is the one of whose image at least `MIN_VIEWS` training photos show the largest share. One of which
-    they show less than `_LEAST` of that moves along the path of a film towards the best, until they show enough.
+    they show less than `_LEAST` of that moves along the path of a film towards the nearest that shows enough, until it
+    does, too.
 
     `roll` turns the pictures, see :func:`kgs.app.files.cameras.rolled`.
     """
@@ -36,7 +38,7 @@ def film_views(fit: Fit, roll: float = 0.0) -> tuple[Views, int]:
 
 
 def _within_reach(fit: Fit, cameras: PinholeCamera) -> tuple[Tensor, int]:
-    """The poses of the cameras, those that show too little moved towards the best, and the index of the best."""
+    """The poses of the cameras, those that show too little moved towards others, and the index of the best."""
     scale = _SIDE / max(image_size(cameras))
     height, width = (max(1, round(scale * side)) for side in image_size(cameras))
     small = to(resized(cameras, scale, (height, width)), "cpu")
@@ -53,8 +55,15 @@ def _within_reach(fit: Fit, cameras: PinholeCamera) -> tuple[Tensor, int]:
     best = int(np.argmax(shares))
     least = _LEAST * shares[best]
     halfway = np.linspace(0, 0.5, _STEPS + 1)  # of the path there and back
+    centers = camera_centers(poses)
+    enough = [i for i, shown in enumerate(shares) if shown >= least]
     for i, shown in enumerate(shares):
-        if shown < least:
-            way = camera_path(small.extrinsics[[i, best]], halfway, depth=1.0).to(poses)
-            poses[i] = next((pose for pose in way[:-1] if share(i, pose) >= least), way[-1])
+        if shown >= least:
+            continue
+        nearest = min(enough, key=lambda k: float((centers[k] - centers[i]).norm()))
+        target = small.extrinsics[nearest]
+        poses[i] = target
+        if float(small.extrinsics[i, 2, :3] @ target[2, :3]) > 0:  # else the path would lead through the scene
+            way = camera_path(small.extrinsics[[i, nearest]], halfway, depth=1.0).to(poses)
+            poses[i] = next((pose for pose in way[:-1] if share(i, pose) >= least), target)
     return poses.to(cameras.extrinsics), best
