@@ -43,15 +43,14 @@ def _within_reach(fit: Fit, cameras: PinholeCamera) -> tuple[Tensor, int]:
     height, width = (max(1, round(scale * side)) for side in image_size(cameras))
     small = to(resized(cameras, scale, (height, width)), "cpu")
     asked = select_evenly(small.batch_size, min(small.batch_size, _MOST))
-    depths = [fit.render_with_depth(select(small, i))[1] for i in asked]
+    depths = [fit.render_with_depth(select(small, i))[1] for i in range(small.batch_size)]
+    asked_depths = [depths[i] for i in asked]
 
-    def share(index: int, pose: Tensor) -> float:
-        camera = posed(select(small, index), pose[None])
-        _, depth = fit.render_with_depth(camera)
-        return float((views_that_show(depth, camera, depths, select(small, asked)) >= MIN_VIEWS).float().mean())
+    def share(camera: PinholeCamera, depth: Tensor) -> float:
+        return float((views_that_show(depth, camera, asked_depths, select(small, asked)) >= MIN_VIEWS).float().mean())
 
     poses = small.extrinsics.clone()
-    shares = [share(i, pose) for i, pose in enumerate(poses)]
+    shares = [share(select(small, i), depth) for i, depth in enumerate(depths)]
     best = int(np.argmax(shares))
     least = _LEAST * shares[best]
     halfway = np.linspace(0, 0.5, _STEPS + 1)  # of the path there and back
@@ -65,5 +64,9 @@ def _within_reach(fit: Fit, cameras: PinholeCamera) -> tuple[Tensor, int]:
         poses[i] = target
         if float(small.extrinsics[i, 2, :3] @ target[2, :3]) > 0:  # else the path would lead through the scene
             way = camera_path(small.extrinsics[[i, nearest]], halfway, depth=1.0).to(poses)
-            poses[i] = next((pose for pose in way[:-1] if share(i, pose) >= least), target)
+            for pose in way[:-1]:
+                camera = posed(select(small, i), pose[None])
+                if share(camera, fit.render_with_depth(camera)[1]) >= least:
+                    poses[i] = pose
+                    break
     return poses.to(cameras.extrinsics), best

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-MIN_OWN = 50  # points that each group sees and the other does not
+_MIN_OWN = 50  # points that each group sees and the other does not
 _SMALL = 0.35  # largest share of a photo's cells with points, in which it sees points that join
 _FLAT = 0.06  # largest thickness of the points that join, over their extent
 _CELLS = 8  # of a photo, along each side
@@ -34,18 +34,18 @@ def moved_photos(reconstruction: Any) -> list[str]:
     cells = _cells(reconstruction, images)
     is_seen = cells >= 0
     shared = is_seen.T.astype(np.int64) @ is_seen
-    groups = [{i} for i in range(len(images))]
-    apart = list[set[int]]()
+    groups = [frozenset([i]) for i in range(len(images))]
+    apart: tuple[int, ...] = ()  # a photo of each of the two groups that stay apart
     for i, j in sorted(combinations(range(len(images)), 2), key=lambda pair: -int(shared[pair])):
         one, other = groups[i], groups[j]
-        if one is other or {id(one), id(other)} == {id(groups[min(group)]) for group in apart}:
+        if one == other or {one, other} == {groups[k] for k in apart}:
             continue
         if not apart and _is_one_flat_thing(points, cells, [*one], [*other]):
-            apart = [one, other]
+            apart = (i, j)
             continue
         joined = one | other
         groups = [joined if k in joined else group for k, group in enumerate(groups)]
-    smaller = min((groups[min(group)] for group in apart), key=len, default=set[int]())
+    smaller = min((groups[k] for k in apart), key=len, default=frozenset[int]())
     return [reconstruction.images[images[k]].name for k in sorted(smaller)]
 
 
@@ -66,7 +66,7 @@ def _is_one_flat_thing(points: NDArray[np.float64], cells: NDArray[np.int64], on
     """Whether all that two groups of columns share is flat, and small in every photo, and each sees much beside it."""
     in_one, in_other = ((cells[:, group] >= 0).any(1) for group in (one, other))
     joining = in_one & in_other
-    if min(len(one), len(other)) < 2 or min((in_one & ~joining).sum(), (in_other & ~joining).sum()) < MIN_OWN:
+    if min(len(one), len(other)) < 2 or min((in_one & ~joining).sum(), (in_other & ~joining).sum()) < _MIN_OWN:
         return False
     shares = []
     for seen in cells[:, [*one, *other]].T:
