@@ -35,6 +35,7 @@ class Frame:
     intrinsics: Intrinsics  # for any size of the photo's aspect
     pose: Tensor  # (4, 4) float64, camera-to-world with OpenCV axes (x right, y down, z forward)
     mask: Mask | None = None  # which of its pixels are kept; None: all
+    depths: Path | None = None  # the file of its depth map
 
     @property
     def path(self) -> Path:

@@ -20,6 +20,7 @@ from kgs._support.errors import ArgumentError, DataError, listed
 from kgs.geometry.cameras import pinhole_cameras
 
 from .border import with_border
+from .depths import find_depths, read_depths, rectified, resized
 from .folders import CAMERAS_REPORT
 from .frames import LARGEST, SMALLEST, Frame, FrameSet
 from .image_file import color_notes
@@ -54,6 +55,7 @@ def load_scene(
     photo_folder: str = "",
     masks: str | PathLike[str] | None = None,
     mask_mode: str = "ignore",
+    depths: str | PathLike[str] | None = None,
 ) -> Scene:
     """Load a scene of posed photos, whatever layout it has.
 
@@ -86,6 +88,8 @@ def load_scene(
             the layout's files name, else those in `masks/`.
         mask_mode: what black in a mask means. "ignore": such pixels are ignored (somebody walked by), see
             `Views.valid_mask`. "transparent": nothing is there, as where an image is transparent.
+        depths: a folder with depth maps of training photos, which have their stems or names (.npy; .png and .tif of one
+            channel), see `Views.depths`; those of test photos are not read. None: there are none.
 
     Raises:
         DataError: the folder is not a scene, or its files are missing, damaged or contradict each other.
@@ -125,6 +129,9 @@ def load_scene(
         offset = centers.mean(dim=0)  # float64; without the test views
         lying = [frame.intrinsics.width >= frame.intrinsics.height for frame in train]
         first = train[lying.index(2 * sum(lying) >= len(lying))]  # of the kind, upright or lying, that most are
+        depth_notes = list[str]()
+        if depths is not None and photos:
+            train, depth_notes = _with_depths(train, frame_set, Path(depths))
         scales = [_Scale.of(first, downscale or 1.0)]
         height, width = scales[0].size
         fine_downscale = max(1.0, (downscale or 1.0) * math.sqrt(height * width / _FINE_PIXELS))
@@ -136,7 +143,7 @@ def load_scene(
         at_size = train_per_scale[0]
         (test_views,) = make_views(test, scales[:1])
         colors = color_notes([frame.image for frame in (*train, *test)])
-        notes = (*frame_set.notes, *_mask_notes([*train, *test], at_size, transparent), *colors)
+        notes = (*frame_set.notes, *_mask_notes([*train, *test], at_size, transparent), *depth_notes, *colors)
         if at_size.border_mask is not None:
             notes += (_BORDER,)
         return Scene(
@@ -175,6 +182,14 @@ def _mask_notes(frames: Sequence[Frame], train: Views, transparent: bool) -> lis
     )
     meaning = "treated as empty" if transparent else f"ignored{share}"
     return [f"masks of {masked} of {len(frames)} photos: black pixels are {meaning}"]
+
+
+def _with_depths(train: Sequence[Frame], frame_set: FrameSet, folder: Path) -> tuple[list[Frame], list[str]]:
+    """The training frames with their depth maps, and a sentence about those that have none."""
+    maps = find_depths([frame.path for frame in (*frame_set.frames, *(frame_set.test or ()))], folder)
+    without = [frame.name for frame in train if frame.path not in maps]
+    notes = [f"training photos without a depth map: {len(without)} ({listed(without)})"] if without else []
+    return [replace(frame, depths=maps.get(frame.path)) for frame in train], notes
 
 
 def _split(
@@ -261,6 +276,7 @@ def _views(
     intrinsics = torch.eye(4, dtype=torch.float32).repeat(len(scales), count, 1, 1)
     alphas: list[dict[int, Tensor]] = [{} for _ in scales]
     valid: list[dict[int, Tensor]] = [{} for _ in scales]
+    depth_maps: list[dict[int, Tensor]] = [{} for _ in scales]
     turned = [False] * count
     for i, frame in enumerate(frames):
         image = None
@@ -274,7 +290,7 @@ def _views(
             lens, maps = rectify(frame.intrinsics.scaled(width, height))
         except ArgumentError as error:
             raise error.about(frame.source, f"{error.name} of {frame.name}") from error
-        kept = None
+        kept = depth_map = None
         if image is not None:
             if frame.mask is not None:
                 kept = frame.mask.kept(frame.path, width, height)
@@ -287,11 +303,14 @@ def _views(
                 image[..., :3] = image[..., :3] * alpha + background.numpy() * (1 - alpha)
             image = remap(image, maps, kept)
             kept = None if kept is None else remap(kept, maps)
+            if frame.depths is not None:
+                depth_map = rectified(read_depths(frame.depths, frame.path, width, height), maps)
         turned[i] = _reduced(width, height, scales[0].factor) != scales[0].size  # it is that size on its side
         if turned[i]:
             lens = lens.turned()
             image = None if image is None else np.ascontiguousarray(np.rot90(image, -1))
             kept = None if kept is None else np.ascontiguousarray(np.rot90(kept, -1))
+            depth_map = None if depth_map is None else np.ascontiguousarray(np.rot90(depth_map, -1))
         for j, scale in enumerate(scales):
             height, width = scale.size
             if image is None:
@@ -304,6 +323,8 @@ def _views(
                     alphas[j][i] = pixels[3:].clone()
                 if kept is not None:
                     valid[j][i] = torch.from_numpy(resize(kept, lens, width, height)[0]) > _VALID
+                if depth_map is not None:
+                    depth_maps[j][i] = torch.from_numpy(resized(depth_map, width, height))
             intrinsics[j, i, :3, :3] = torch.from_numpy(reduced_lens.matrix())
     poses = torch.zeros(count, 4, 4, dtype=torch.float64)
     for i, frame in enumerate(frames):
@@ -317,7 +338,9 @@ def _views(
         stacked = torch.stack([alphas[j].get(i, opaque) for i in range(count)]) if alphas[j] else None
         every = opaque[0] > 0
         valid_mask = torch.stack([valid[j].get(i, every) for i in range(count)]) if valid[j] else None
+        unknown = torch.zeros_like(opaque[0])
+        depths = torch.stack([depth_maps[j].get(i, unknown) for i in range(count)]) if depth_maps[j] else None
         cameras = pinhole_cameras(extrinsics, intrinsics[j], *scale.size[::-1])
         turns = tuple(turned) if any(turned) else None
-        views.append(Views(cameras, images[j], names, stacked, valid_mask=valid_mask, turned=turns))
+        views.append(Views(cameras, images[j], names, stacked, valid_mask=valid_mask, turned=turns, depths=depths))
     return views

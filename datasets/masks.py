@@ -91,7 +91,7 @@ def find_masks(photos: Sequence[Path], root: Path, folder: Path | None = None) -
     for inner in folders if folder is None else [folder]:
         own = [photo for photo in photos if folder or inner.parent == root or photo.is_relative_to(inner.parent)]
         files = [path for path in sorted(inner.rglob("*")) if path.suffix.lower() in _SUFFIXES and path.name[0] != "."]
-        found = _fitting(inner, files, own)
+        found = fitting(inner, [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES], own, "mask")
         if not found and (files or folder):
             got = listed([path.relative_to(inner) for path in files]) or "nothing"
             raise DataError(inner, "", "pictures with the stems or names of photos", got)
@@ -114,21 +114,27 @@ def find_masks(photos: Sequence[Path], root: Path, folder: Path | None = None) -
     return MaskFiles(masks, lost, unused)
 
 
-def _fitting(folder: Path, files: Iterable[Path], photos: Iterable[Path]) -> dict[Path, Path]:
-    """The photos of the masks in a folder and its subfolders, by mask."""
+def fitting(folder: Path, files: Iterable[Path], photos: Iterable[Path], what: str) -> dict[Path, Path]:
+    """The photos of the files in a folder and its subfolders, by file; those that fit no photo are left out.
+
+    A file has the stem of its photo, or the whole name, before its ending. `what` it is, errors say.
+
+    Raises:
+        DataError: a file fits several photos.
+    """
     by_name = dict[str, list[Path]]()
     for photo in photos:
         for name in {photo.name.lower(), photo.stem.lower()}:
             by_name.setdefault(name, []).append(photo)
     found = dict[Path, Path]()
-    for mask in files:
-        inner = _lower(mask.parent.relative_to(folder))
-        alike = by_name.get(mask.stem.lower(), []) if mask.suffix.lower() in IMAGE_SUFFIXES else []
-        fitting = [photo for photo in alike if _lower(photo.parent)[-len(inner) :] == inner or not inner]
-        if len(fitting) > 1:
-            raise DataError(mask, "", "a mask of one photo", f"one that fits {fitting[0]} and {fitting[1]}")
-        if fitting:
-            found[mask] = fitting[0]
+    for file in files:
+        inner = _lower(file.parent.relative_to(folder))
+        alike = by_name.get(file.stem.lower(), [])
+        matches = [photo for photo in alike if _lower(photo.parent)[-len(inner) :] == inner or not inner]
+        if len(matches) > 1:
+            raise DataError(file, "", f"a {what} of one photo", f"one that fits {matches[0]} and {matches[1]}")
+        if matches:
+            found[file] = matches[0]
     return found
 
 

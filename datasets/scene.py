@@ -38,6 +38,8 @@ class Views(ShownByShapes):
             None: 1. They are estimated before a fit, and loaders set none.
         turned: whether each photo was turned by a quarter clockwise, and its camera with it, to have the size of the
             others; None: none was.
+        depths: `(V, H, W)` float32, the depth maps of the photos as their files have them: depths, or depths or inverse
+            depths up to scale and shift; 0: unknown. None: there are none. Initial points alone are made of them.
 
     Raises:
         TypeError: the images are not a tensor of floating point numbers.
@@ -59,6 +61,7 @@ class Views(ShownByShapes):
     valid_mask: Tensor | None = None
     gains: Tensor | None = None
     turned: tuple[bool, ...] | None = None
+    depths: Tensor | None = None
 
     def __post_init__(self) -> None:
         count = len(self.names)
@@ -80,6 +83,7 @@ class Views(ShownByShapes):
             "border_mask": (height, width),
             "valid_mask": (count, height, width),
             "gains": (count, 3),
+            "depths": (count, height, width),
         }
         for name, shape in shapes.items():
             if (value := getattr(self, name)) is not None and tuple(value.shape) != shape:
@@ -130,6 +134,7 @@ class Views(ShownByShapes):
             valid_mask=None if self.valid_mask is None else self.valid_mask[rows],
             gains=None if self.gains is None else self.gains[rows],
             turned=None if self.turned is None else tuple(self.turned[i] for i in indices),
+            depths=None if self.depths is None else self.depths[rows],
         )
 
     def render(self, index: int, render: Callable[..., Tensor]) -> Tensor:
@@ -172,12 +177,14 @@ class Views(ShownByShapes):
     def downsample(self, factor: int) -> Self:
         """The views at 1 / factor of the width and height: means of factor x factor pixels; what is left over is cut.
 
-        Images with fewer rows or columns than that are a ValueError.
+        Of depths one of these pixels is taken, the middle one. Images with fewer rows or columns than that are a
+        ValueError.
         """
         size = self.images.shape[-2] // factor, self.images.shape[-1] // factor
         if 0 in size:
             given = tuple(self.images.shape[-2:])
             raise ArgumentError("images", f"at least {factor} x {factor} pixels to downsample", given)
+        middles = slice(factor // 2, None, factor)
         return replace(
             self,
             cameras=resized(self.cameras, 1 / factor, size),
@@ -185,6 +192,7 @@ class Views(ShownByShapes):
             alphas=None if self.alphas is None else avg_pool2d(self.alphas, factor),
             border_mask=None if self.border_mask is None else avg_pool2d(self.border_mask[None], factor)[0],
             valid_mask=None if self.valid_mask is None else avg_pool2d(self.valid_mask.float(), factor) == 1,
+            depths=None if self.depths is None else self.depths[:, middles, middles][:, : size[0], : size[1]],
         )
 
 

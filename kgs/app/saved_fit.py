@@ -1,6 +1,7 @@
 """Reads a fit from its folder: its settings, its scene, and its Gaussians."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +77,8 @@ def load_fit(
     with errors_of(out / "metrics.json"), state_errors():
         history = {name: metrics[name] for name in _HISTORY}
         decisions = Decisions.from_dict(metrics["decisions"])
-    scene = _posed(_exposed(request.load(out, say), path, values), path, values)
+    without_depths = replace(request, depths="")  # which a fit needs before its first step
+    scene = _posed(_exposed(without_depths.load(out, say), path, values), path, values)
     options = RasterOptions(near_plane=float(values["near_plane"]), max_bytes=settings.max_bytes)
     fit = Fit(scene, model, options, backend, settings, history, decisions, metrics, tuple(values["notes"]), part)
     return request, fit

@@ -36,6 +36,7 @@ class SceneRequest:
         photo_folder: name of the folder of photos, as "images_8"; "": that of the largest.
         masks: the folder of their masks; "": where the scene's files say, or `masks/`.
         mask_mode: what black in a mask means, "ignore" or "transparent".
+        depths: the folder of depth maps; "": there are none.
     """
 
     scene: str
@@ -50,6 +51,7 @@ class SceneRequest:
     photo_folder: str = ""
     masks: str = ""
     mask_mode: str = "ignore"
+    depths: str = ""
 
     def load(self, base: Path, say: Callable[[str], None] | None = None, source: SceneSource | None = None) -> "Scene":
         """Load the scene.
@@ -71,6 +73,7 @@ class SceneRequest:
             photo_folder=self.photo_folder,
             masks=base / self.masks if self.masks else None,
             mask_mode=self.mask_mode,
+            depths=base / self.depths if self.depths else None,
         )
         if say is not None:
             for note in scene.notes:
@@ -130,6 +133,7 @@ _EXPECTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "roll": ("a number", lambda v: is_number(v)),
     "title": ("a text", lambda v: isinstance(v, str)),
     "masks": ("a path or nothing", lambda v: isinstance(v, str) and "\0" not in v),
+    "depths": ("a path or nothing", lambda v: isinstance(v, str) and "\0" not in v),
     "mask_mode": (f"one of {list(MASK_MODES)}", lambda v: v in MASK_MODES),
     "photo_folder": (
         "images, images_ and a number, or nothing",

@@ -100,6 +100,8 @@ class TrainState:
             depth=median,
         )
         state = cls._assemble(scene, plan, model, start)
+        for note in points.notes:
+            state.note(note)
         if points.reserve is not None and plan.schedule.error_points:
             state.error_points = ErrorPoints.of(points.reserve, scene.train, 10 * plan.config.seed + 5, plan.device)
         return state

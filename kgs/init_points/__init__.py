@@ -43,6 +43,7 @@ class InitialPoints(ShownByShapes):
         patches: of "dense", the colours of the surface in the views that agree on it; else None.
         views: of "dense", the number of the view that each point's colour is from, `(P,)` int64; else None.
         reserve: of "dense", the points that two views agree on, too, but that were not drawn; else None.
+        notes: what a user should know of them, one sentence each.
     """
 
     points: Tensor
@@ -51,6 +52,7 @@ class InitialPoints(ShownByShapes):
     patches: PatchColors | None = None
     views: Tensor | None = None
     reserve: Reserve | None = None
+    notes: tuple[str, ...] = ()
 
 
 @cpu_by_default
@@ -76,11 +78,12 @@ def initial_points(
     Args:
         views: the training views, and only these.
         kind: "dense": points of depth maps that at least two views agree on, drawn at random; if they are fewer than
-            1000, "sift" with a warning. "sift": SIFT keypoints of the images, matched and triangulated with the given
-            poses; if they are fewer than 20, "random" with a warning. "random": spread evenly over the space that at
-            least two of the views see (one, if there is only one), in the images' mean colours there; its depths are
-            those of the SIFT points, or follow from the cameras. "file": the points of a 3DGS PLY file, or of a cloud
-            or mesh that trimesh reads, up to 1 GiB.
+            1000, "sift" with a warning. Where no two views agree, points of `views.depths`, if there are any, once
+            their scale and shift are found; maps that do not fit are left out with a warning. "sift": SIFT keypoints of
+            the images, matched and triangulated with the given poses; if they are fewer than 20, "random" with a
+            warning. "random": spread evenly over the space that at least two of the views see (one, if there is only
+            one), in the images' mean colours there; its depths are those of the SIFT points, or follow from the
+            cameras. "file": the points of a 3DGS PLY file, or of a cloud or mesh that trimesh reads, up to 1 GiB.
         seed: of the random draws.
         count: how many points "random" gives, and "dense" at most; >= 1. None: of "dense" one for every 3 pixels with
             an agreed depth, 30 000 at least and 60 000 at most, 90 000 of up to three views; of "random" 30 000.
@@ -121,7 +124,8 @@ def initial_points(
         near, far = sweep_range(tracked, cameras)
         dense = dense_points(views, near, far, count, generator, bar, backend, draw, pixels, where)
         if dense.agreed >= (MIN_DENSE if count is None else min(MIN_DENSE, count)):
-            return InitialPoints(dense.points, dense.colors, kind, dense.patches, dense.views, dense.reserve)
+            parts = (dense.patches, dense.views, dense.reserve, dense.notes)
+            return InitialPoints(dense.points, dense.colors, kind, *parts)
         message = (
             f"initial points: {len(views)} training views agree on {dense.agreed} points only; SIFT points instead"
         )

@@ -117,6 +117,22 @@ def agreeing_views(
         yield other, pixels, inside & near & certain[other][y, x]
 
 
+def before_surfaces(
+    cameras: PinholeCamera, maps: list[DepthMap], agreed: list[Tensor], depths: Tensor, view: int
+) -> Tensor:
+    """Which pixels of a view at depths `(H, W)` lie before what another view agrees on, bool `(H, W)`.
+
+    That view would see them there. Pixels of depth 0 are passed over.
+    """
+    hides = torch.zeros_like(depths, dtype=torch.bool)
+    rows, columns = depths.nonzero().unbind(1)
+    for other, pixels, there in _in_other_views(cameras, depths[rows, columns], rows, columns, view):
+        x, y, inside = nearest_pixels(pixels, there, *depths.mT.shape)
+        is_before = there < (1 - SIMILAR) * maps[other].depths[y, x]
+        hides[rows, columns] |= inside & agreed[other][y, x] & is_before
+    return hides
+
+
 def _in_other_views(
     cameras: PinholeCamera, depths: Tensor, rows: Tensor, columns: Tensor, view: int
 ) -> Iterator[tuple[int, Tensor, Tensor]]:

@@ -15,6 +15,7 @@ from kornia.geometry.camera import PinholeCamera
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kgs._support.errors import quantity
 from kgs._support.progress import ProgressBar, silent
 from kgs._support.shown import ShownByShapes
 from kgs.datasets.scene import Views
@@ -22,6 +23,7 @@ from kgs.geometry.cameras import to
 from kgs.geometry.multiview import unproject
 
 from .agreement import average_depths, consistent_pixels
+from .depth_maps import map_depths
 from .patches import PatchColors, patch_colors
 from .plane_sweep import DepthMap, plane_count, planes_wanted, sweep_depths
 
@@ -58,7 +60,7 @@ class Reserve(ShownByShapes):
 
 
 class DensePoints(NamedTuple):
-    """Points on which two views agree."""
+    """Points on which two views agree, then those of the photos' depth maps, if any, where no two agree."""
 
     points: Tensor  # (P, 3) float32
     colors: Tensor  # (P, 3), RGB in [0, 1]
@@ -66,6 +68,7 @@ class DensePoints(NamedTuple):
     patches: PatchColors  # the colours of all agreed patches
     views: Tensor  # (P,), the view that each colour is from
     reserve: Reserve
+    notes: tuple[str, ...] = ()  # on the points of the photos' depth maps
 
 
 def dense_points(
@@ -80,7 +83,7 @@ def dense_points(
     pixels: int | None = None,
     device: torch.device | None = None,
 ) -> DensePoints:
-    """At most `count` points on which two views agree, drawn at random.
+    """At most `count` points on which two views agree, drawn at random, and with `views.depths` others between them.
 
     The scene lies between the depths `near` and `far`; the sky behind it gets points, too.
 
@@ -89,27 +92,47 @@ def dense_points(
 
     `draw` is "uniform", or "spread" evenly over the images: one point from each of about as many cells. Points lie
     where the pixels of both views are usable. Depth maps are made on `device`, None for a CPU; points are on the CPU.
+
+    Where no two views agree there are points of `views.depths`, as densely as the others, but one for
+    `PIXELS_OF_A_POINT` pixels at most. With a `count` of None they are more points, at most as many again.
     """
     pixels = pixels or views.images[:, 0].numel()
     views = small_enough(views, near, far)
     maps, certain = agreed_depths(views, near, far, bar, backend, device)
     cameras = to(views.cameras, "cpu", torch.float64)
-    parts = [_agreed(views, cameras, maps, certain, view) for view in range(len(views))]
-    points, colors, view_pixels = map(torch.cat, zip(*parts, strict=True))
+    agreed = [consistent_pixels(cameras, maps, certain, view) for view in range(len(views))]
+    points, colors, view_pixels = _points_at(views, cameras, [depth_map.depths for depth_map in maps], agreed)
+    filled, errors = map_depths(views, cameras, maps, agreed, near / SKY, SKY * far)
+    more_points, more_colors, more_pixels = _points_at(views, cameras, filled, [depths > 0 for depths in filled])
     if count is None:
-        agreed = round(pixels * len(points) / views.images[:, 0].numel())
+        all_pixels = views.images[:, 0].numel()
+        agreed_pixels = round(pixels * len(points) / all_pixels)
         maximum = MAX_POINTS_FEW_VIEWS if len(views) <= FEW_VIEWS else MAX_POINTS
-        count = min(max(agreed // PIXELS_OF_A_POINT, MIN_POINTS), maximum)
+        count = min(max(agreed_pixels // PIXELS_OF_A_POINT, MIN_POINTS), maximum)
+        density = min(count / max(agreed_pixels, 1), 1 / PIXELS_OF_A_POINT)
+        more = min(round(density * pixels * len(more_points) / all_pixels), maximum)
+    else:
+        more = min(round(count * len(more_points) / max(len(points) + len(more_points), 1)), count - 1)
+        count -= more
     view, x, y = view_pixels.unbind(1)
     is_sky = torch.stack([depth_map.depths for depth_map in maps])[view, y, x] > SKY * far
-    chosen = torch.randperm(len(points), generator=generator)
-    chosen = chosen[_one_per_cell(view_pixels[chosen].numpy(), count)] if draw == "spread" else chosen[:count]
+    chosen = _drawn(view_pixels, count, generator, draw)
     chosen = chosen[_with_less_sky(is_sky[chosen])]
     of_view = [view_pixels[view == i, 1:] for i in range(len(views))]
     patches = patch_colors(views, cameras, maps, certain, of_view)
     is_left = torch.ones(len(points), dtype=torch.bool).index_fill(0, chosen, False)
     reserve = Reserve(points[is_left].float(), colors[is_left], view[is_left])
-    return DensePoints(points[chosen].float(), colors[chosen], int((~is_sky).sum()), patches, view[chosen], reserve)
+    drawn = [points[chosen].float(), colors[chosen], view[chosen]]
+    notes = list[str]()
+    if errors:
+        others = _drawn(more_pixels, more, generator, draw)
+        parts = [more_points[others].float(), more_colors[others], more_pixels[others, 0]]
+        drawn = [torch.cat(pair) for pair in zip(drawn, parts, strict=True)]
+        of_maps = f"{len(errors)} of {quantity(len(views), 'photo')}"
+        off = f"{float(np.median(errors)):.1%} off where photos agree"
+        notes.append(f"initial points from depth maps: {len(others)}, from the maps of {of_maps}, which are {off}")
+    agreed_count = int((~is_sky).sum())
+    return DensePoints(drawn[0], drawn[1], agreed_count, patches, drawn[2], reserve, tuple(notes))
 
 
 def small_enough(views: Views, near: float, far: float) -> Views:
@@ -139,6 +162,12 @@ def agreed_depths(
     if usable is not None:
         certain = [mask & part for mask, part in zip(certain, usable.cpu(), strict=True)]
     return average_depths(to(views.cameras, "cpu", torch.float64), maps, certain), certain
+
+
+def _drawn(view_pixels: Tensor, count: int, generator: torch.Generator, draw: str) -> Tensor:
+    """The rows of at most `count` of these pixels `(view, x, y)`, in random order unless they are spread."""
+    chosen = torch.randperm(len(view_pixels), generator=generator)
+    return chosen[_one_per_cell(view_pixels[chosen].numpy(), count)] if draw == "spread" else chosen[:count]
 
 
 def _with_less_sky(is_sky: Tensor) -> Tensor:
@@ -172,13 +201,16 @@ def _first_of_each(numbers: NDArray[np.int64], end: int) -> NDArray[np.int64]:
     return first[first >= 0]
 
 
-def _agreed(
-    views: Views, cameras: PinholeCamera, maps: list[DepthMap], certain: list[Tensor], view: int
+def _points_at(
+    views: Views, cameras: PinholeCamera, depths: list[Tensor], chosen: list[Tensor]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The points of one view's pixels on which views agree, their colours, and their `(view, x, y)`."""
-    rows, columns = consistent_pixels(cameras, maps, certain, view).nonzero().unbind(1)
-    pixels = torch.stack([columns, rows], 1)
-    depths = maps[view].depths[rows, columns].double()
-    points = unproject(cameras, pixels, depths, torch.full_like(rows, view))
-    view_pixels = torch.stack([torch.full_like(rows, view), columns, rows], 1)
-    return points, views.images[view].cpu()[:, rows, columns].mT, view_pixels
+    """The points of the chosen pixels `(H, W)` of each view at its depths, their colours, and their `(view, x, y)`."""
+    parts = []
+    for view, own in enumerate(depths):
+        rows, columns = chosen[view].nonzero().unbind(1)
+        pixels = torch.stack([columns, rows], 1)
+        points = unproject(cameras, pixels, own[rows, columns].double(), torch.full_like(rows, view))
+        view_pixels = torch.stack([torch.full_like(rows, view), columns, rows], 1)
+        parts.append((points, views.images[view].cpu()[:, rows, columns].mT, view_pixels))
+    points, colors, view_pixels = map(torch.cat, zip(*parts, strict=True))
+    return points, colors, view_pixels

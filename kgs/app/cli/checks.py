@@ -78,11 +78,13 @@ def check_results(out: Path) -> None:
         raise DataError(config, "", "this file in the folder of the results of kgs fit", "none")
 
 
-def check_init(init: str, source: "Source") -> None:
-    """Raise an ArgumentError unless a fit can begin with these initial points."""
+def check_init(init: str, source: "Source", depths: Path | None) -> None:
+    """Raise an ArgumentError unless a fit can begin with these initial points, which depth maps are of use for."""
     if init == "scene" and (source.scene is None or source.scene.layout != "Blender"):
         kind = "photos without camera poses" if source.scene is None else f"the layout {source.scene.layout}"
         raise ArgumentError("init", f"another one for {kind}", "'scene', Blender's points")
+    if depths is not None and init != "dense":
+        raise ArgumentError("depths", "none without the init 'dense'", depths)
 
 
 def check_frames(frames: int | None, source: "Source") -> None:

@@ -23,7 +23,7 @@ from .words import options_in
 
 # The short help shows these entries of FitConfig, and all other options of the command but the rare ones.
 _OF_CONFIG = ("steps", "drop", "refine_poses", "seed", "device")
-_RARE = ("downscale", "background", "lpips_weights", "mask_mode", "roll", "frames", "title", "config")
+_RARE = ("downscale", "background", "lpips_weights", "mask_mode", "depths", "roll", "frames", "title", "config")
 
 
 def first_config(words: list[str]) -> FitConfig:
@@ -57,6 +57,7 @@ def fit(
     frames: IfGiven[int] = None,
     masks: IfGiven[Path] = None,
     mask_mode: Literal["ignore", "transparent"] = "ignore",
+    depths: IfGiven[Path] = None,
     preset: Literal["auto", "paper", "plain"] = "auto",
     detail: Literal["low", "normal", "high"] = "normal",
     measure: Flag = False,
@@ -91,6 +92,8 @@ def fit(
         masks: folder of masks, white where a photo is kept: IMG_1.png or IMG_1.jpg.png of IMG_1.jpg. Unless given:
             masks/.
         mask_mode: what black in a mask means. ignore: these pixels do not count. transparent: empty space.
+        depths: folder of depth maps, of a network or a sensor: IMG_1.npy, .png or .tif of IMG_1.jpg. They give initial
+            points where no two photos agree on a depth.
         preset: auto: what the training views need. paper: DropGaussian's rule and recipe, as published. plain: the same
             without dropping. See --preset paper --help-all.
         detail: sets size, steps and initial points together. low: 378 pixels. high: 1000 pixels. Options given by name
@@ -127,7 +130,7 @@ def fit(
     with Results.open(out, "fit", ["photos"] if source.is_unposed else [], resume) as results:
         shortest = min_side(config, lpips_weights is not None)
         check_photos(source, views, hold_out, size, downscale, frames, shortest)
-        check_init(config.init, source)
+        check_init(config.init, source, depths)
         if resume and config.device == "auto" and begun_on_cpu(out):
             config = replace(config, device="cpu")  # on a GPU it would go on with other bits
         device = load_tools(config.device, config.backend, "safetensors", "jinja2")
@@ -144,6 +147,7 @@ def fit(
             title=title or "",
             masks="" if masks is None else os.path.abspath(masks),
             mask_mode=mask_mode,
+            depths="" if depths is None else os.path.abspath(depths),
         )
         is_free = size is None and downscale is None  # the size follows from --detail
         if is_free:

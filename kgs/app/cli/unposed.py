@@ -41,7 +41,10 @@ def find_scene(
     """
     from kgs.app.scene_request import in_plain_words
     from kgs.app.sfm import pose
+    from kgs.datasets.depths import find_depths
 
+    if request.depths:  # an error now, not once there are cameras, about the names of the copies
+        find_depths([path.with_suffix(".png") for path in source.photos], Path(request.depths))
     masks = Path(request.masks) if request.masks else None
     with on_ctrl_c("the cameras were not found yet, and nothing was written"):
         report = pose.pose(source, results, seed=seed, masks=masks, frames=frames, for_fit=True)

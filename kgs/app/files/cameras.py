@@ -86,6 +86,7 @@ def rolled(views: Views, degrees: float) -> Views:
         alphas=None if views.alphas is None else rotated(views.alphas),
         border_mask=None if views.border_mask is None else rotated(views.border_mask),
         valid_mask=None if views.valid_mask is None else rotated(views.valid_mask),
+        depths=None if views.depths is None else rotated(views.depths),
     )
 
 
