@@ -88,12 +88,13 @@ def fitted(values: Tensor, depths: Tensor, pixels: Tensor) -> tuple[Tensor, floa
         pixels: which these are, bool `(H, W)`.
     """
     known = values[pixels]
-    depth, error = _line(known, depths)
-    inverse, inverse_error = _line(known, 1 / depths)
-    _, constant_error = _line(torch.zeros_like(known), depths)
-    if error <= inverse_error:
-        return depth[0] * values + depth[1], error, constant_error
-    return 1 / (inverse[0] * values + inverse[1]), inverse_error, constant_error
+    line, error = _line(known, depths)
+    inverse_line, inverse_error = _line(known, 1 / depths)
+    is_inverse = inverse_error < error
+    slope, shift = inverse_line if is_inverse else line
+    lined = slope * values + shift
+    _, constant_error = _line(torch.zeros_like(known), 1 / depths if is_inverse else depths)
+    return 1 / lined if is_inverse else lined, min(error, inverse_error), constant_error
 
 
 def _line(x: Tensor, y: Tensor) -> tuple[Tensor, float]:

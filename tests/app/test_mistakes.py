@@ -58,6 +58,8 @@ def splats(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         ("fit '' -o {out}", "scene: expected a path, got ''"),
         ("fit ''", "scene: expected a path, got ''"),
         ("fit {scene} -o {out} --masks=", "--masks: expected a path, got ''"),
+        ("fit {scene} -o {out} --depths=", "--depths: expected a path, got ''"),
+        ("fit {scene} -o {out} --depths {scene} --init random", "--depths: expected none without the init 'dense'"),
         ("fit {scene} -o {out} --init file --init-file ''", "--init-file: expected a path, got ''"),
         ("eval {fit} --device foo", "--device: expected"),
         ("page {splat} --cameras {scene} -o {out}/page.html", "expected a folder to write it to"),

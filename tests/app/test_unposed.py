@@ -4,6 +4,7 @@ import json
 import shutil
 import sys
 
+import numpy as np
 import pytest
 import torch
 from command import one_line, run
@@ -16,6 +17,7 @@ from kgs.app.files.outputs import write_png
 from kgs.app.sfm.source import Source
 from kgs.datasets import synthetic_scene
 from kgs.datasets.folders import scene_nearby
+from kgs.datasets.synthetic import synthetic_depths
 
 SIZE = (72, 96)
 FIT = ("--steps", 6, "--init", "random", "--init-points", 200, "--preset", "plain")
@@ -89,6 +91,24 @@ def test_a_folder_of_photos_becomes_a_fit(folder, tmp_path, capsys, monkeypatch)
     assert run("fit", tmp_path / "photos4", "-o", out, *FIT) == 0  # again, in the folder that it made
     out.rename(tmp_path / "moved")
     assert run("eval", tmp_path / "moved") == 0
+
+
+def test_depth_maps_give_initial_points_and_are_not_needed_again(folder, truth, tmp_path, capsys):
+    photos = folder(4)
+    depths = tmp_path / "depths"
+    depths.mkdir()
+    for i, values in enumerate(synthetic_depths(truth.cameras)[:3, 0]):
+        np.save(depths / f"IMG_{i}.npy", 1 / values.numpy())
+    out = tmp_path / "out"
+    fit = ("--init-points", 1500, "--preset", "plain", "--depths", depths)
+    assert run("fit", photos, "-o", out, "--steps", 6, *fit) == 0
+    said = capsys.readouterr().out
+    assert "training photos without a depth map: 1 (IMG_3.png)" in said
+    (line,) = [line for line in said.splitlines() if line.startswith("initial points from depth maps: ")]
+    assert "from the maps of 3 of 4 photos" in line
+    assert json.loads((out / "config.json").read_text())["request"]["depths"] == str(depths)
+    shutil.rmtree(depths)
+    assert run("eval", out) == 0
 
 
 def test_cameras_alone_make_a_scene_that_is_fitted_as_its_photos_are(folder, tmp_path, capsys):

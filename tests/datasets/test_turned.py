@@ -25,6 +25,7 @@ def write(root: Path, turned: tuple[int, ...], mask: int | None = None) -> Path:
     """The painted planes as nerfstudio has them; photos in `turned` as an upright camera would have taken them."""
     views = painted_planes()
     (root / "images").mkdir(parents=True)
+    (root / "depths").mkdir()
     frames = {}
     for i, name in enumerate(NAMES):
         image = (views.images[i].permute(1, 2, 0).numpy()[..., ::-1] * 255).round().astype(np.uint8)
@@ -34,14 +35,16 @@ def write(root: Path, turned: tuple[int, ...], mask: int | None = None) -> Path:
         pose = np.linalg.inv(views.cameras.extrinsics[i].double().numpy())
         kept = np.full((height, width), 255, np.uint8)
         kept[: height // 3] = 0
+        depths = np.arange(1.0, height * width + 1).reshape(height, width)
         if i in turned:  # x' = y, y' = W - x
-            image, kept = np.rot90(image), np.rot90(kept)
+            image, kept, depths = np.rot90(image), np.rot90(kept), np.rot90(depths)
             fx, fy, cx, cy = fy, fx, cy, width - cx
             height, width = width, height
             pose = pose @ BACK
         cv2.imwrite(str(root / "images" / name), image)
         lens = {"w": width, "h": height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
         frames[f"images/{name}"] = {"transform_matrix": (pose @ OPENGL).tolist(), **lens}
+        np.save(root / "depths" / f"{i}.npy", depths)
         if i == mask:
             (root / "masks").mkdir()
             cv2.imwrite(str(root / "masks" / name), kept)
@@ -56,8 +59,8 @@ def close(one: PinholeCamera, other: PinholeCamera) -> bool:
 
 @pytest.mark.parametrize(("turned", "downscale"), [(0, None), (1, None), (2, 1.5)])
 def test_the_rarer_kind_is_turned_with_its_camera(tmp_path: Path, turned: int, downscale: float | None):
-    mixed = load_scene(write(tmp_path / "mixed", (turned,), mask=turned), downscale=downscale, hold_out=0).train
-    plain = load_scene(write(tmp_path / "plain", (), mask=turned), downscale=downscale, hold_out=0).train
+    folders = write(tmp_path / "mixed", (turned,), mask=turned), write(tmp_path / "plain", (), mask=turned)
+    mixed, plain = (load_scene(root, None, downscale, hold_out=0, depths=root / "depths").train for root in folders)
     assert mixed.turned == tuple(i == turned for i in range(3))
     assert plain.turned is None
     assert close(mixed.cameras, plain.cameras)
@@ -65,6 +68,12 @@ def test_the_rarer_kind_is_turned_with_its_camera(tmp_path: Path, turned: int, d
     assert mixed.valid_mask is not None
     assert plain.valid_mask is not None
     assert torch.equal(mixed.valid_mask, plain.valid_mask)
+    assert mixed.depths is not None
+    assert plain.depths is not None
+    assert torch.equal(mixed.depths, plain.depths)
+    taken = shown(mixed)[turned]
+    assert taken.depths is not None
+    assert torch.equal(taken.depths[0], plain.depths[turned].rot90())
 
 
 def test_where_most_photos_are_upright_the_lying_ones_are_turned(tmp_path: Path):

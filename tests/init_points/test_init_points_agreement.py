@@ -7,7 +7,7 @@ from init_point_scenes import cameras
 
 from kgs.geometry.cameras import to
 from kgs.init_points import agreement
-from kgs.init_points.agreement import average_depths, consistent_pixels
+from kgs.init_points.agreement import average_depths, before_surfaces, consistent_pixels
 from kgs.init_points.plane_sweep import DepthMap
 
 WIDTH, HEIGHT, DEPTH = 40, 30, 4.0
@@ -87,3 +87,20 @@ def test_small_pieces_at_the_depths_around_them_stay(monkeypatch):
     assert not agreement._strays(depths, certain).any()
     depths[14:] = DEPTH / 2
     assert torch.equal(agreement._strays(depths, certain), certain & (torch.arange(HEIGHT) >= 14)[:, None])
+
+
+@pytest.mark.parametrize(("share", "hides"), [(0.7, True), (0.96, True), (0.98, False), (1.3, False)])
+def test_depths_before_an_agreed_surface_are_found(share, hides):
+    agreed = torch.zeros_like(EVERYWHERE)
+    agreed[10:20, 5:30] = True
+    depths = torch.full((HEIGHT, WIDTH), share * DEPTH, dtype=torch.float64)
+    depths[15] = 0.0  # none
+    before = before_surfaces(GEOMETRY, [wall(DEPTH), wall(DEPTH)], [EVERYWHERE, agreed], depths, 0)
+    rows, columns = before.nonzero().unbind(1)
+    assert before.any() == hides
+    if hides:
+        pixels = [row for row in range(10, 20) if row != 15]
+        assert rows.unique().tolist() == pixels
+        shift = round(3.5 / share)
+        assert len(rows) == 25 * len(pixels)
+        assert abs(int(columns.min()) - 5 - shift) <= 1
