@@ -19,12 +19,12 @@ from kgs.datasets.scene import Views
 from .agreement import before_surfaces
 from .plane_sweep import DepthMap
 
-MAX_ERROR = 0.1  # of depth, the median: three photos agree on depths ten times as precise
+MAX_ERROR = 0.1  # of depth, relative, in the median: farther off, points are of no surface near them
 MIN_PIXELS = 100  # that photos agree on
 # A map also has to be better than one depth for all pixels: in a shallow scene that is right within 10 %, too.
 MAX_OF_CONSTANT = 0.5  # of the error of that depth
 LINES = 500  # through two pixels each; a third of wrong pixels leaves half of them
-SAMPLE = 4000  # pixels that each line is compared with
+SAMPLE = 1000  # pixels that each line is compared with
 NEAR = 3.0  # times the median error, within which pixels count in the least squares
 EXACT = 1e-4  # error up to which all pixels do
 
@@ -54,6 +54,7 @@ def map_depths(
     found = MapDepths([torch.zeros_like(depth_map.depths, dtype=torch.float64) for depth_map in maps], [])
     if views.depths is None:
         return found
+    usable = views.usable
     faults = []
     for view, values in enumerate(views.depths.cpu().double()):
         if not values.any():
@@ -67,8 +68,8 @@ def map_depths(
             faults.append(f"{views.names[view]} ({error:.0%} off, one depth for all {of_constant:.0%})")
             continue
         depths[agreed[view] | (values == 0) | (depths < nearest) | (depths > farthest)] = 0.0
-        if views.usable is not None:
-            depths[~views.usable[view].cpu()] = 0.0
+        if usable is not None:
+            depths[~usable[view].cpu()] = 0.0
         depths[before_surfaces(cameras, maps, agreed, depths, view)] = 0.0
         found.depths[view] = depths
         found.errors.append(error)
