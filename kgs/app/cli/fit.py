@@ -23,7 +23,7 @@ from .words import options_in
 
 # The short help shows these entries of FitConfig, and all other options of the command but the rare ones.
 _OF_CONFIG = ("steps", "drop", "refine_poses", "seed", "device")
-_RARE = ("downscale", "background", "lpips_weights", "mask_mode", "roll", "frames", "title", "config")
+_RARE = ("downscale", "background", "lpips_weights", "mask_mode", "depths", "roll", "frames", "title", "config")
 
 
 def first_config(words: list[str]) -> FitConfig:
