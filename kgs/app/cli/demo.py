@@ -30,7 +30,7 @@ BANANAS = FitConfig(
     exposure="same",
     coarse=0.7,
     init_points=30_000,
-    max_gaussians=36_000,
+    max_gaussians=38_000,
     evaluations=4,
 )
 _ROOM = replace(BANANAS, coarse=0.3, init_points=12_000, max_gaussians=16_000)
