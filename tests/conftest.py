@@ -1,10 +1,11 @@
 """Fixtures for all tests, their order, and settings."""
 
 import functools
+import gc
 import json
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
 import cv2
@@ -40,6 +41,17 @@ _FIRST = [
     *("test_cli", "test_fit_folder", "test_init_points_dense", "test_kernels_compositing", "test_not_finite"),
     *("test_gpu_fit", "test_bits", "test_extreme_cases", "test_cli_process", "test_run", "test_sfm_folders"),
 ]
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Without the garbage collector, which finds nothing: all modules and tests that are collected stay to the end."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()  # nor looks among them again during the tests
+        gc.enable()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
