@@ -83,8 +83,11 @@ def columns_inside(turn, y, last_x, last_y, first, last):
 
 
 @exact
-def warp_row(turn, y, other, begin, end, row, offset):
-    """Write an image at the positions of columns `begin` to `end` - 1 of row y to `row`, from `offset` on; bilinear."""
+def warp_row(turn, y, other, begin, end, places, weights, row, offset):
+    """Write an image at the positions of columns `begin` to `end` - 1 of row y to `row`, from `offset` on; bilinear.
+
+    Positions first: that loop is vector code on any processor, while pixels are gathered one by one on some.
+    """
     stride = np.int32(other.shape[1])
     last_x = np.float64(other.shape[1] - 2)
     last_y = np.float64(other.shape[0] - 2)
@@ -104,10 +107,14 @@ def warp_row(turn, y, other, begin, end, row, offset):
         v = v if v < last_y else last_y
         column = np.int32(u)
         line = np.int32(v)
-        right = f32(u - np.float64(column))
-        down = f32(v - np.float64(line))
-        i = np.uint32(line * stride + column)
-        below = np.uint32(line * stride + column + stride)
+        weights[0, k] = f32(u - np.float64(column))
+        weights[1, k] = f32(v - np.float64(line))
+        places[k] = line * stride + column
+    for k in range(end - begin):
+        right = weights[0, k]
+        down = weights[1, k]
+        i = np.uint32(places[k])
+        below = i + np.uint32(stride)
         upper = pixels[i] + right * (pixels[i + np.uint32(1)] - pixels[i])
         lower = pixels[below] + right * (pixels[below + np.uint32(1)] - pixels[below])
         row[offset + k] = upper + down * (lower - upper)
@@ -120,6 +127,8 @@ def compare_tiles(begin, end, image, mean, variance, constants, others, homograp
     height, width, planes = cost.shape
     tiles_across = -(-width // TILE_COLUMNS)
     share = 1.0 / SIDE**2
+    places = np.empty(TILE_COLUMNS + 2 * HALO, np.int32)  # of the pixels of a row
+    weights = np.empty((2, TILE_COLUMNS + 2 * HALO), np.float32)  # to the right and below them
     row = np.zeros(TILE_COLUMNS + 2 * HALO, np.float32)
     rows = np.zeros((SIDE, TILE_COLUMNS + 2 * HALO), np.float32)  # the last ones
     sums = np.zeros((3, TILE_COLUMNS + 2 * HALO))  # of these rows' columns: warped, its square, its product
@@ -151,7 +160,7 @@ def compare_tiles(begin, end, image, mean, variance, constants, others, homograp
                         limits[1, slot] = high
                         row[:] = ZERO
                         if low <= high:
-                            warp_row(turn, inside, others[n], low, high + 1, row, low - left + HALO)
+                            warp_row(turn, inside, others[n], low, high + 1, places, weights, row, low - left + HALO)
                         for x in range(first - left + HALO):
                             row[x] = row[first - left + HALO]  # the border is replicated
                         for x in range(last - left + HALO + 1, columns + 2 * HALO):

@@ -1,7 +1,8 @@
 """The guard: cells of a run beside stored ones of an earlier commit, for a change of the recipe or the code of fits.
 
-Two fits from changed code are two draws, even with one seed. So the noise of their difference is sqrt(2) times the
-standard deviation between seeds, that of the default on the same scene.
+Two fits from changed code are two draws, even with one seed. So the noise of a scene's difference is sqrt(2) times the
+standard deviation between seeds, that of the default on the same scene. The verdict rests on the spread over scenes: a
+scene may be ten times as noisy as the others, and the mean of scenes' noises would be its noise alone.
 """
 
 import json
@@ -26,8 +27,9 @@ Row = Mapping[str, Any]
 _NOTES = (
     "Change: to the stored cell of the same seed, in brackets its noise: sqrt(2) times the standard deviation of the "
     f"stored default between seeds. A change of more than {LIMIT:.0f} noises is marked with !. Three seeds say little "
-    "of a standard deviation: where nothing but chance is at work, about one change of a scene in five is marked, and "
-    "one mean of eight scenes in sixteen. The standard error is that of the mean, from the spread over scenes.",
+    "of a standard deviation: where nothing but chance is at work, about one change of a scene in five is marked.",
+    "The change of the mean has its 95 % interval from the spread over scenes (Student's t), and is marked where that "
+    "is beyond 0.",
     "PSNR, and LPIPS with VGG16 and inputs in [0, 1], of held-out photos; seconds of processor time of initial points "
     "and fit, which only compare on one machine with the same load.",
     "By default seed 0 alone is fitted. `--seeds 0 1 2` also fits what stored cells tell the noise by; "
@@ -55,7 +57,7 @@ MEASURES = (
 
 
 class Change(NamedTuple):
-    """The mean of a measure, that of its changes, and the noise of this; NaN where there is none."""
+    """The mean of a measure of a scene, that of its changes, and the noise of this; NaN where there is none."""
 
     value: float
     difference: float
@@ -72,6 +74,27 @@ class Change(NamedTuple):
             return "-"
         noise = "" if math.isnan(self.noise) else f" ({self.noise:.{decimals}f})"
         return signed(self.difference, decimals) + noise + (" !" if self.is_beyond_noise else "")
+
+
+class MeanChange(NamedTuple):
+    """The mean over scenes of a measure's changes, and its 95 % interval over scenes; NaN where there is none."""
+
+    difference: float
+    low: float
+    high: float
+
+    @property
+    def is_beyond_noise(self) -> bool:
+        """Whether 0 is outside of the interval."""
+        return self.low > 0 or self.high < 0  # NaN is not
+
+    def text(self, decimals: int) -> str:
+        """As "-0.12 [-0.18, -0.06] !"."""
+        if math.isnan(self.difference):
+            return "-"
+        low, high = (signed(limit, decimals) for limit in (self.low, self.high))
+        interval = "" if math.isnan(self.low) else f" [{low}, {high}]"
+        return signed(self.difference, decimals) + interval + (" !" if self.is_beyond_noise else "")
 
 
 def write_guard(rows: Sequence[Row], out: Path, command: str, planned: int, stored: Path = STORED) -> str:
@@ -133,46 +156,41 @@ def _tables(new: pd.DataFrame, old: pd.DataFrame, default: pd.DataFrame) -> tupl
     tables = {}
     beyond = list[str]()
     single = list[Change]()
-    of_default = dict[str, Change]()
+    of_default = dict[str, MeanChange]()
     for (method,), cells in grouped(new, "method"):
-        scenes = [*cells.setting.unique()]
-        lines = [{"scene": scene} for scene in scenes]
-        if len(scenes) > 1:
-            lines += [{"scene": f"mean of {len(scenes)} scenes"}, {"scene": "standard error"}]
+        lines = [{"scene": scene} for scene in cells.setting.unique()]
+        mean_line = {"scene": f"mean of {len(lines)} scenes"}
         for measure in MEASURES:
             decimals = measure.decimals_of_change
-            changes, mean, error = _changes(cells, old[old.method == method], default, measure)
-            for line, change in zip(lines, [*changes, mean], strict=False):
-                line[measure.head] = "-" if math.isnan(change.value) else f"{change.value:.{measure.decimals}f}"
-                line[measure.head_of_change] = change.text(decimals)
-            if len(scenes) > 1 and not math.isnan(error):
-                lines[-1][measure.head_of_change] = f"{error:.{decimals}f}"
+            changes, mean = _changes(cells, old[old.method == method], default, measure)
+            values = [*(change.value for change in changes), cells.groupby("setting")[measure.key].mean().mean()]
+            texts = [*(change.text(decimals) for change in changes), mean.text(decimals)]
+            for line, value, text in zip([*lines, mean_line], values, texts, strict=True):
+                line[measure.head] = "-" if math.isnan(value) else f"{value:.{measure.decimals}f}"
+                line[measure.head_of_change] = text
             if method == AUTO:
                 of_default[measure.key] = mean
             single += [change for change in changes if not math.isnan(change.noise)]
             if mean.is_beyond_noise:
                 beyond.append(f"{method}: {measure.head} {mean.text(decimals)}")
-        tables[method] = table_of(lines)
-    count = sum(change.is_beyond_noise for change in single)
-    if not single:
-        return tables, ["There is nothing stored to tell a change from noise by."]
+        tables[method] = table_of([*lines, mean_line] if len(lines) > 1 else lines)
     verdict = f"Beyond noise in the mean: {'; '.join(beyond)}." if beyond else "No mean has changed beyond noise."
+    count = sum(change.is_beyond_noise for change in single)
     counted = f"{count} of {len(single)} changes of single scenes are beyond noise."
     return tables, [_answer(of_default), verdict, counted]
 
 
-def _answer(means: Mapping[str, Change]) -> str:
+def _answer(means: Mapping[str, MeanChange]) -> str:
     """Whether a change of the default is to be kept, by its mean over scenes: it gains and loses no more than it may.
 
-    It gains where PSNR or LPIPS is better by more than `LIMIT` noises.
+    It gains where PSNR or LPIPS is better by its whole interval.
     """
-    if not means:
-        return "The default was not fitted: there is no verdict."
-    better = {"psnr": means["psnr"], "lpips": means["lpips"]._replace(difference=-means["lpips"].difference)}
-    gains = [key for key, change in better.items() if change.difference > 0 and change.is_beyond_noise]
-    worse = better["psnr"]._replace(difference=-better["psnr"].difference)
-    losses = {"psnr": worse, "lpips": means["lpips"], "seconds": means["seconds"]}
-    lost = [key for key, change in losses.items() if change.difference > MAX_LOSS[key]]
+    if not means or all(math.isnan(change.low) for change in means.values()):
+        return "There is no verdict: it takes two scenes with stored fits of the default."
+    better = {"psnr": means["psnr"].low > 0, "lpips": means["lpips"].high < 0}
+    gains = [key for key, is_better in better.items() if is_better]
+    losses = {key: means[key].difference for key in MAX_LOSS} | {"psnr": -means["psnr"].difference}
+    lost = [key for key, loss in losses.items() if loss > MAX_LOSS[key]]
     if gains and not lost:
         return f"Yes: it gains in {' and '.join(gains)}, and loses no more than it may."
     why = f"it loses too much in {' and '.join(lost)}" if lost else "nothing is gained beyond noise"
@@ -181,11 +199,8 @@ def _answer(means: Mapping[str, Change]) -> str:
 
 def _changes(
     new: pd.DataFrame, old: pd.DataFrame, default: pd.DataFrame, measure: Measure
-) -> tuple[list[Change], Change, float]:
-    """Of one method: the change of each scene, in order of appearance, that of their mean, and its standard error.
-
-    The noise of the mean is known if that of each scene with a change is.
-    """
+) -> tuple[list[Change], MeanChange]:
+    """Of one method: the change of each scene, in order of appearance, and that of their mean."""
     value, before, by_seed = (
         frame.pivot(index="seed", columns="setting", values=measure.key) for frame in (new, old, default)
     )
@@ -194,10 +209,9 @@ def _changes(
     noise = by_seed.std() * (100 / by_seed.mean() if measure.percent else 1.0)
     noise = noise.reindex(change.columns) * (2 / change.count()) ** 0.5
     scenes = pd.DataFrame({"value": value.mean(), "difference": change.mean(), "noise": noise})
-    mean = paired_difference(change)
-    noise_of_mean = math.sqrt((noise**2).sum(skipna=False)) / max(1, mean.scenes)
     changes = [Change(*numbers) for numbers in scenes.loc[new.setting.unique()].itertuples(index=False)]
-    return changes, Change(value.mean().mean(), mean.mean, noise_of_mean), mean.error
+    mean = paired_difference(change)
+    return changes, MeanChange(mean.mean, *mean.over_scenes)
 
 
 def _origin(result: Row) -> str:

@@ -34,7 +34,6 @@ class Difference(NamedTuple):
     sd: float = math.nan
     scenes: int = 1
     over_scenes: tuple[float, float] = (math.nan, math.nan)
-    error: float = math.nan  # the standard error of the mean over scenes
 
     def text(self, decimals: int = 2, *, labels: bool = False) -> str:
         """As "+0.31 [+0.10, +0.52]"; an interval that is not known is left out, and "-" stands for no pairs.
@@ -84,13 +83,12 @@ def paired_difference(differences: pd.DataFrame) -> Difference:
     means = differences.mean()
     k = len(means)
     mean = float(means.mean())
-    error = float(means.std()) / math.sqrt(max(1, k))
     noise = noise_floor(differences)
     by_seeds = _half_interval(noise.freedom, noise.sd * math.sqrt((1 / counts).sum()) / max(1, k))
-    by_scenes = _half_interval(k - 1, error)
+    by_scenes = _half_interval(k - 1, float(means.std()) / math.sqrt(max(1, k)))
     over_scenes = (mean - by_scenes, mean + by_scenes)
     pairs = int(counts.sum())
-    return Difference(pairs, mean, mean - by_seeds, mean + by_seeds, noise.sd, k, over_scenes, error)
+    return Difference(pairs, mean, mean - by_seeds, mean + by_seeds, noise.sd, k, over_scenes)
 
 
 def _half_interval(freedom: int, error: float) -> float:

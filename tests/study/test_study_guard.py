@@ -103,13 +103,12 @@ def test_changes_are_those_to_the_cell_of_the_same_seed(rows_of, report, tmp_pat
         assert line["change of Gaussians [%]"] == "+0.0 (0.0)"
 
 
-def test_the_mean_has_the_noise_of_its_scenes_and_a_standard_error(rows_of, report):
+def test_the_mean_has_its_interval_over_scenes(rows_of, report):
     new = [*rows_of(scenes=(FERN,), change=0.4), *rows_of(scenes=(FLOWER,), change=0.2)]
     found = table(report(new))
-    expected = math.sqrt(noise(FERN) ** 2 + noise(FLOWER) ** 2) / 2
-    assert found["mean of 2 scenes"]["change of PSNR [dB]"] == f"+0.30 ({expected:.2f})"
+    half = 12.706 * 0.1  # Student's t of one degree of freedom, times half the distance of the two
+    assert found["mean of 2 scenes"]["change of PSNR [dB]"] == f"+0.30 [{0.3 - half:+.2f}, {0.3 + half:+.2f}]"
     assert found["mean of 2 scenes"]["PSNR [dB]"] == "23.30"
-    assert found["standard error"]["change of PSNR [dB]"] == "0.10"  # half the distance of two numbers
     assert list(table(report(new[:1]))) == [FERN]
 
 
@@ -117,9 +116,7 @@ def test_the_mean_has_the_noise_of_its_scenes_and_a_standard_error(rows_of, repo
     ("noises", "mark", "sentence"),
     [
         (1.9, "", "0 of 4 changes of single scenes are beyond noise"),
-        (2.1, " !", "1 of 4 changes of single scenes are beyond noise"),
-        (-1.9, "", "No mean has changed beyond noise"),
-        (-2.1, " !", "Beyond noise in the mean: auto: PSNR [dB] -"),
+        (-2.1, " !", "1 of 4 changes of single scenes are beyond noise"),
     ],
 )
 def test_what_is_beyond_two_noises_is_marked(noises, mark, sentence, rows_of, report):
@@ -132,19 +129,24 @@ def test_what_is_beyond_two_noises_is_marked(noises, mark, sentence, rows_of, re
 @pytest.mark.parametrize(
     ("changes", "verdict"),
     [
-        ({"change": 2.1}, "Yes: it gains in psnr"),
-        ({"change": 1.9}, "No: nothing is gained beyond noise"),
+        ({"changes": (0.3, 0.31)}, "Yes: it gains in psnr"),
+        ({"changes": (0.3, 3.0)}, "No: nothing is gained beyond noise"),
         ({"lpips": 0.09}, "Yes: it gains in lpips"),
-        ({"change": 2.1, "factor": 1.2}, "No: it loses too much in seconds"),
-        ({"change": 2.1, "lpips": 0.104}, "No: it loses too much in lpips"),
-        ({"change": -1.0, "lpips": 0.09}, "No: it loses too much in psnr"),
-        ({"methods": (PAPER,)}, "there is no verdict"),
+        ({"changes": (0.3, 0.31), "factor": 1.2}, "No: it loses too much in seconds"),
+        ({"changes": (0.3, 0.31), "lpips": 0.104}, "No: it loses too much in lpips"),
+        ({"changes": (-0.2, -0.21), "lpips": 0.09}, "No: it loses too much in psnr"),
+        ({"methods": (PAPER,)}, "There is no verdict"),
     ],
 )
 def test_the_verdict_is_yes_or_no(changes, verdict, rows_of, report):
-    """PSNR by noises; LPIPS has none here, so that any gain of it is beyond."""
-    change = changes.pop("change", 0.0) * noise(FERN)
-    assert verdict in report(rows_of(scenes=(FERN,), change=change, **changes))
+    """By the interval over two scenes, whose changes of LPIPS are the same."""
+    psnr = changes.pop("changes", (0.0, 0.0))
+    scenes = zip((FERN, FLOWER), psnr, strict=True)
+    assert verdict in report([row for scene, change in scenes for row in rows_of((scene,), change=change, **changes)])
+
+
+def test_one_scene_gives_no_verdict(rows_of, report):
+    assert "There is no verdict" in report(rows_of(scenes=(FERN,), change=9.0))
 
 
 @pytest.mark.parametrize(
@@ -156,7 +158,7 @@ def test_the_noise_is_told_by_seeds(seeds, stored_seeds, noises, rows_of, report
     keep(stored, lambda cell: cell["seed"] in stored_seeds)
     text = report(rows_of(seeds=seeds, change=0.1))
     assert table(text)[FERN]["change of PSNR [dB]"] == f"+0.10{noises}"
-    assert ("nothing stored to tell a change from noise by" in text) == (not noises)
+    assert ("0 of 0 changes of single scenes" in text) == (not noises)
 
 
 def test_without_stored_cells_of_these_settings_there_are_values_alone(rows_of, report, tmp_path):
@@ -165,7 +167,7 @@ def test_without_stored_cells_of_these_settings_there_are_values_alone(rows_of, 
         (row["cell"],) = with_steps([row["cell"]], 30)
     for text in (report(rows_of(), tmp_path / "none.jsonl"), report(other_steps)):
         assert list(table(text)[FERN]) == ["scene", "PSNR [dB]", "LPIPS", "seconds", "Gaussians"]
-        assert "There is nothing stored" in text
+        assert "There is no verdict" in text
         assert "0 of them with a stored one" in text
 
 
@@ -174,8 +176,7 @@ def test_a_stored_cell_that_is_missing_leaves_its_scene_out_of_the_mean_change(r
     found = table(report(rows_of(change=0.3)))
     assert found[FLOWER]["change of PSNR [dB]"] == "-"
     assert found[FLOWER]["PSNR [dB]"] == "22.30"
-    assert found["mean of 2 scenes"]["change of PSNR [dB]"] == f"+0.30 ({noise(FERN):.2f})"
-    assert found["standard error"]["change of PSNR [dB]"] == "-"
+    assert found["mean of 2 scenes"]["change of PSNR [dB]"] == "+0.30"
 
 
 def test_without_weights_lpips_is_left_out(rows_of, report):
