@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from init_point_scenes import cameras, painted_planes
 from refusals import refused
 from trainers import assert_same_bits, begun, fitted, settled, stop_at
 
@@ -38,15 +39,27 @@ def reserve_of(views: Views, shape=(HEIGHT, WIDTH)) -> Reserve:
     return Reserve(points.float(), colors, which)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def reserve(scene):
     return reserve_of(scene.train)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def dense(points, reserve):
     """The initial points with a reserve."""
     return replace(points, reserve=reserve)
+
+
+@pytest.fixture(scope="module")
+def whole(scene, dense):
+    """A fit of them that was not stopped."""
+    return fitted(scene, dense, CONFIG)
+
+
+@pytest.fixture(scope="module")
+def plain(scene, points):
+    """The same of points without a reserve."""
+    return fitted(scene, points, CONFIG)
 
 
 @pytest.fixture
@@ -169,8 +182,8 @@ def test_there_are_never_more_than_max_gaussians(scene, dense):
     assert counts(begun(scene, dense, CONFIG, max_gaussians=100)) == [150] * 50
 
 
-def test_old_gaussians_and_their_moments_stay_and_new_ones_have_none(scene, dense):
-    trainers = begun(scene, dense, CONFIG), begun(scene, replace(dense, reserve=None), CONFIG)
+def test_old_gaussians_and_their_moments_stay_and_new_ones_have_none(scene, points, dense):
+    trainers = begun(scene, dense, CONFIG), begun(scene, points, CONFIG)
     for trainer in trainers:
         trainer.fit(stop_at(10))
     added, without = (trainer.state for trainer in trainers)
@@ -196,20 +209,16 @@ def test_errors_are_those_of_the_renders_of_the_fit(scene, dense):
     assert [view for _, _, view in pixels_of(trainer.model)[150:]] == [1] * 15
 
 
-def test_points_without_a_reserve_and_the_papers_presets_add_none(scene, points, dense):
-    for other in (points, replace(dense, reserve=None)):
-        assert_same_bits(fitted(scene, other, CONFIG), fitted(scene, points, CONFIG, recipe=off()))
-    assert_same_bits(fitted(scene, dense, CONFIG, recipe=off()), fitted(scene, points, CONFIG))
+def test_points_without_a_reserve_and_the_papers_presets_add_none(scene, points, dense, plain):
+    off = replace(CONFIG.recipe, error_points=0.0)
+    for given in (points, dense):
+        assert_same_bits(fitted(scene, given, CONFIG, recipe=off), plain)
     for preset in ("paper", "plain"):
         assert make_schedule(settled(PRESETS[preset])).error_points == ()
 
 
-def off() -> Recipe:
-    return replace(CONFIG.recipe, error_points=0.0)
-
-
-def test_the_same_seed_has_the_same_bits_and_another_one_other_points(scene, dense):
-    assert_same_bits(fitted(scene, dense, CONFIG), fitted(scene, dense, CONFIG))
+def test_the_same_seed_has_the_same_bits_and_another_one_other_points(scene, dense, whole):
+    assert_same_bits(fitted(scene, dense, CONFIG), whole)
     points = [ErrorPoints.of(dense.reserve, scene.train, seed, CPU) for seed in (0, 1)]
     for one in points:
         observe(one, 0, torch.ones(HEIGHT, WIDTH))
@@ -217,9 +226,8 @@ def test_the_same_seed_has_the_same_bits_and_another_one_other_points(scene, den
 
 
 @pytest.mark.parametrize("step", [4, 10, 17, 30, 40])
-def test_a_resumed_fit_has_the_bits_of_one_that_was_not_stopped(scene, dense, tmp_path, step):
+def test_a_resumed_fit_has_the_bits_of_one_that_was_not_stopped(scene, dense, whole, tmp_path, step):
     path = tmp_path / "checkpoint.safetensors"
-    whole = fitted(scene, dense, CONFIG)
     stopped = begun(scene, dense, CONFIG)
     stopped.fit(stop_at(step))
     stopped.save(path)
@@ -230,15 +238,15 @@ def test_a_resumed_fit_has_the_bits_of_one_that_was_not_stopped(scene, dense, tm
     assert_same_bits(resumed, whole)
 
 
-def test_a_state_that_was_loaded_can_be_loaded_again(scene, dense):
+def test_a_state_that_was_loaded_can_be_loaded_again(scene, dense, whole):
     trainer = begun(scene, dense, CONFIG)
     trainer.fit(stop_at(10))
     saved = trainer.state_dict()
-    others = begun(scene, dense, CONFIG), begun(scene, dense, CONFIG)
-    for other in others:
+    for _ in range(2):
+        other = begun(scene, dense, CONFIG)
         other.load_state_dict(saved)
         other.fit()
-    assert_same_bits(*others)
+        assert_same_bits(other, whole)
 
 
 @pytest.mark.parametrize("name", ["colors", "views", "errors", "is_left"])
@@ -250,6 +258,12 @@ def test_a_saved_state_with_rows_missing_is_refused(scene, dense, name):
 
 
 # -- the reserve -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def planes():
+    """Of a quarter of the pixels."""
+    return painted_planes(cameras(size=(120, 90)))
 
 
 def test_the_reserve_of_dense_points_is_what_was_agreed_on_and_not_drawn(planes):
