@@ -97,7 +97,7 @@ def test_the_presets_of_the_paper_have_none(scene, preset):
 
 # -- of a scene -----------------------------------------------------------------------------------------------------
 
-CONFIG = FitConfig(steps=100, evaluations=1, sh_degree=0, init_points=6000, max_gaussians=6000)
+CONFIG = FitConfig(steps=70, evaluations=1, sh_degree=0, init_points=6000, max_gaussians=6000)
 EXPOSURES = torch.tensor([[0.3, 0.3, 0.3], [0.6, 0.6, 0.6], [1.25, 1.25, 1.25], [1.1, 1.0, 0.6]])[[0, 1, 2, 3, 1, 2]]
 
 

@@ -43,7 +43,7 @@ def test_values_of_few_levels_and_one_value_are_no_special_case() -> None:
 @pytest.fixture(scope="module")
 def room() -> tuple[Views, torch.Tensor]:
     """Three views of the room, and their true depths `(3, H, W)`."""
-    views = synthetic_scene(train_views=3, size=(126, 168)).train
+    views = synthetic_scene(train_views=3, size=(105, 140)).train
     return views, synthetic_depths(views.cameras)[:, 0].float()
 
 
