@@ -1,5 +1,6 @@
 """Photos from a video: sharp frames, spread by how far the camera moved, upright as the file's header says."""
 
+import shutil
 import struct
 import subprocess
 import sys
@@ -189,20 +190,26 @@ def of_length(video: Path, count: int) -> Path:
     return video
 
 
+@pytest.fixture(scope="module")
+def honest(tmp_path_factory):
+    """A video of 50 frames, and which of them are taken."""
+    video = write_video(tmp_path_factory.mktemp("honest") / "clip.avi", np.linspace(0, 40, 50).tolist())
+    return video, take(video)
+
+
 @pytest.mark.parametrize(
     ("lie", "count"),
     [
-        (thousand_a_second, 3268),
+        (thousand_a_second, 49 * 33 + 1),
         (lambda video: of_length(video, 0), 0),
         (lambda video: of_length(video, 16), 16),
         (lambda video: of_length(video, 10**6), 10**6),
     ],
     ids=["1000 a second", "none", "few", "many"],
 )
-def test_frames_are_counted_as_they_are_decoded(tmp_path, lie, count):
-    video = write_video(tmp_path / "clip.avi", np.linspace(0, 40, 100).tolist())
-    expected = take(video)
-    lying = lie(video.rename(tmp_path / "same.avi"))
+def test_frames_are_counted_as_they_are_decoded(honest, tmp_path, lie, count):
+    video, expected = honest
+    lying = lie(shutil.copy(video, tmp_path / video.name))
     assert cv2.VideoCapture(str(lying)).get(cv2.CAP_PROP_FRAME_COUNT) == count
     assert take(lying) == expected
 
