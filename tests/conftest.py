@@ -146,6 +146,14 @@ def _signals_arrive() -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def _nothing_waits_for_the_disk() -> Iterator[None]:
+    """Leave files to the system, which writes them when it likes: no test takes the power from its machine."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda descriptor: None)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def _short_films() -> Iterator[None]:
     """Make films of two frames, unless a test sets more: each fit makes one."""
     with pytest.MonkeyPatch.context() as patch:

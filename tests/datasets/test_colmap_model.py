@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from new_files import write_anew
 
 from kgs._support.errors import DataError
 from kgs.datasets.layouts.colmap_model import read_cameras, read_frames, read_images, read_points, read_rigs
@@ -24,7 +25,7 @@ POINTS = struct.pack("<QQ3d3BdQ4I", 1, 77, 1.0, 2.0, 3.0, 10, 20, 30, 0.5, 2, 9,
 
 
 def packed(folder: Path, name: str, data: bytes) -> Path:
-    (folder / name).write_bytes(data)
+    write_anew(folder / name, data)
     return folder / name
 
 

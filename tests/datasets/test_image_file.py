@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import PIL.Image
 import pytest
+from new_files import write_anew
 from PIL.ExifTags import Base
 from refusals import refused
 from tiny_scenes import plain_png, png_chunk, png_of, read_image
@@ -283,7 +284,7 @@ def test_cut_headers_are_data_errors(tmp_path: Path, suffix: str) -> None:
     cv2.imwrite(str(path), np.zeros((4, 5, 3), np.uint8))
     data = path.read_bytes()
     for length in range(min(len(data), 40)):
-        path.write_bytes(data[:length])
+        write_anew(path, data[:length])
         with contextlib.suppress(DataError):
             assert ImageFile(path).size == (5, 4)
     path.write_bytes(data[:3])

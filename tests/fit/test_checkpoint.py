@@ -8,6 +8,7 @@ import stat
 import pytest
 import safetensors.torch
 import torch
+from new_files import write_anew
 from refusals import refused
 
 from kgs import DataError
@@ -55,7 +56,7 @@ def test_every_flipped_byte_and_every_cut_is_found(path):
         flipped = bytearray(content)
         flipped[position] ^= 1 << position % 8
         for damaged in (flipped, content[:position]):
-            path.write_bytes(damaged)
+            write_anew(path, damaged)
             with refused(DataError, path=path):
                 load_checkpoint(path)
     path.write_bytes(content + b"1")
