@@ -39,7 +39,7 @@ def test_damaged_files_are_sound_or_refused(
     folder, outcomes = valid(reader), set[str]()
 
     @seed(4)  # else what is drawn hangs on the words of this function
-    @settings(max_examples=examples, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
+    @settings(max_examples=examples, database=None, suppress_health_check=list(HealthCheck))
     @given(st.data())
     def check(data: st.DataObject) -> None:
         name, damage = data.draw(st.sampled_from(reader.targets))
