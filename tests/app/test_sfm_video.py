@@ -19,7 +19,7 @@ from kgs.app.sfm.find import find_video
 from kgs.app.sfm.video import FRAMES, _Reader, take_frames
 
 SIZE = (320, 240)
-FOCAL = 0.8 * SIZE[0]
+SMALL = (160, 120)
 
 
 def write_video(path: Path, degrees: list[float], blurred: tuple[int, ...] = (), size=SIZE) -> Path:
@@ -28,8 +28,9 @@ def write_video(path: Path, degrees: list[float], blurred: tuple[int, ...] = (),
     code = "MJPG" if path.suffix == ".avi" else "mp4v"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*code), 30, size)
     assert writer.isOpened()
+    focal = 0.8 * size[0]
     for i, angle in enumerate(degrees):
-        move = np.array([[1, 0, -FOCAL * np.tan(np.radians(angle))], [0, 1, -20.0]])
+        move = np.array([[1, 0, -focal * np.tan(np.radians(angle))], [0, 1, -20.0]])
         frame = cv2.warpAffine(wall, move, size, borderMode=cv2.BORDER_WRAP)
         writer.write(cv2.GaussianBlur(frame, (0, 0), 3.0) if i in blurred else frame)
     writer.release()
@@ -50,7 +51,7 @@ def test_frames_are_spread_by_motion_and_sharp(tmp_path):
     rest = [0.0] * 40
     way = np.linspace(0, 40, 81).tolist()
     blurred = tuple(range(41, 121, 2))
-    numbers = take(write_video(tmp_path / "clip.avi", rest + way, blurred))
+    numbers = take(write_video(tmp_path / "clip.avi", rest + way, blurred, SMALL))
     assert len(numbers) == FRAMES
     assert not set(numbers) & set(blurred)
     angles = np.array([([*rest, *way])[i] for i in numbers])
@@ -62,7 +63,7 @@ def test_frames_are_spread_by_motion_and_sharp(tmp_path):
 def test_how_many_frames(tmp_path, degrees, count, expected):
     """Neighbours are 3 to 10 degrees apart, unless a number is given."""
     equal = np.degrees(np.arctan(np.radians(np.arange(0, degrees + 0.1)))).tolist()  # ways in the image
-    assert len(take(write_video(tmp_path / "clip.avi", equal), count)) == expected
+    assert len(take(write_video(tmp_path / "clip.avi", equal, size=SMALL), count)) == expected
 
 
 def turn_by_a_quarter(video: Path) -> None:
@@ -171,7 +172,7 @@ def thousand_a_second(video: Path) -> Path:
     capture = cv2.VideoCapture(str(video))
     with av.open(str(lying), "w") as container:
         stream = container.add_stream("ffv1", rate=1000)
-        stream.width, stream.height = SIZE
+        stream.width, stream.height = SMALL
         stream.pix_fmt = "bgr0"
         for i, (_, pixels) in enumerate(iter(capture.read, (False, None))):
             frame = av.VideoFrame.from_ndarray(pixels, "bgr24")
@@ -193,7 +194,7 @@ def of_length(video: Path, count: int) -> Path:
 @pytest.fixture(scope="module")
 def honest(tmp_path_factory):
     """A video of 50 frames, and which of them are taken."""
-    video = write_video(tmp_path_factory.mktemp("honest") / "clip.avi", np.linspace(0, 40, 50).tolist())
+    video = write_video(tmp_path_factory.mktemp("honest") / "clip.avi", np.linspace(0, 40, 50).tolist(), size=SMALL)
     return video, take(video)
 
 
