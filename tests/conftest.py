@@ -54,6 +54,11 @@ def pytest_collection() -> Generator[None, object, object]:
         gc.enable()
 
 
+def pytest_unconfigure() -> None:
+    """Let the end find what it would find without that: Triton tells what it takes for a leak."""
+    gc.unfreeze()
+
+
 def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
     """Skip the numba variant of tests that only torch can run; under `pytest -n`, put the files of `_FIRST` first."""
     items[:] = [item for item in items if not _runs_on_torch_again(item)]
