@@ -21,7 +21,7 @@ def kgs_process(*arguments, shell):
     return subprocess.run(command, capture_output=True, timeout=200, env=env)
 
 
-FIT = ("--init", "random", "--init-points", 50, "--steps", 12)
+FIT = ("--init", "random", "--init-points", 50, "--steps", 2)
 RESULTS = {"index.html", "splat.ply", "metrics.json", "config.json", "curve.png", "test"}
 
 

@@ -201,14 +201,15 @@ def test_a_mask_is_upright_or_as_the_photo_is_stored(tmp_path, stored):
 
 
 @pytest.mark.parametrize("kind", ["alpha", "mask", "both"])
-def test_a_colour_that_is_hidden_does_not_show_in_a_reduced_photo(tmp_path, kind):
+def test_a_colour_that_is_hidden_does_not_show_in_a_reduced_photo(tmp_path, monkeypatch, kind):
     """One colour is seen, another is hidden: at the border only the first one shows."""
-    height, width = 1700, 1900
+    monkeypatch.setattr("kgs.app.sfm.read.LONGEST", 400)
+    height, width = 425, 475
     y, x = np.mgrid[:height, :width]
-    hidden = (np.hypot(x - 900, y - 850) < 501.3) | (x < 33)
+    hidden = (np.hypot(x - 225, y - 212) < 125.3) | (x < 9)
     image = np.where(hidden[..., None], np.uint8([0, 255, 0]), np.uint8([30, 60, 200]))
     if kind != "mask":
-        image = np.dstack([image, np.where(hidden & (kind == "alpha") | (y > 1600), 0, 255).astype(np.uint8)])
+        image = np.dstack([image, np.where(hidden & (kind == "alpha") | (y > 400), 0, 255).astype(np.uint8)])
     cv2.imwrite(str(tmp_path / "a.png"), image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if kind != "alpha":
         (tmp_path / "masks").mkdir()

@@ -20,7 +20,7 @@ from kgs.datasets.folders import scene_nearby
 from kgs.datasets.synthetic import synthetic_depths
 
 SIZE = (72, 96)
-FIT = ("--steps", 6, "--init", "random", "--init-points", 200, "--preset", "plain")
+FIT = ("--steps", 2, "--init", "random", "--init-points", 200, "--preset", "plain")
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +101,7 @@ def test_depth_maps_give_initial_points_and_are_not_needed_again(folder, truth, 
         np.save(depths / f"IMG_{i}.npy", 1 / values.numpy())
     out = tmp_path / "out"
     fit = ("--init-points", 1500, "--preset", "plain", "--depths", depths)
-    assert run("fit", photos, "-o", out, "--steps", 6, *fit) == 0
+    assert run("fit", photos, "-o", out, "--steps", 2, *fit) == 0
     said = capsys.readouterr().out
     assert "training photos without a depth map: 1 (IMG_3.png)" in said
     (line,) = [line for line in said.splitlines() if line.startswith("initial points from depth maps: ")]

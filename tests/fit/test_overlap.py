@@ -92,10 +92,10 @@ def test_what_is_given_is_not_decided(scene, given):
 
 
 def test_a_whole_fit_says_what_it_decided():
-    """Eight photos of the room, all of which show most patches."""
-    large = synthetic_scene(train_views=8, test_views=1, size=(72, 96))
+    """Five photos of the room, most of which show most patches: some dropping is left."""
+    large = synthetic_scene(train_views=5, test_views=1, size=(72, 96))
     fit = fit_scene(large, FitConfig(steps=4, evaluations=1))
     found = fit.decisions.overlap
-    assert 3 <= found.views_per_pair <= found.views_per_patch <= 8
-    assert found.drop == fit.settings.drop == pytest.approx(drop_rate_for(found.views_per_pair), abs=0.01)
+    assert 3 <= found.views_per_pair <= found.views_per_patch <= 5
+    assert 0 < found.drop == fit.settings.drop == pytest.approx(drop_rate_for(found.views_per_pair), abs=0.01)
     assert found.steps is None
