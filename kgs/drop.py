@@ -72,6 +72,8 @@ class DropGaussian(nn.Module):
         ValueError: p or the rate is outside [0, 1), the schedule is unknown, or the seed not from -2^63 to 2^64 - 1.
     """
 
+    __call__: Callable[..., Tensor]  # for type checkers, to which torch's says Any
+
     def __init__(
         self,
         p: float | Tensor = 0.2,

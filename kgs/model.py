@@ -6,7 +6,7 @@ points (the release's: the paper says mean distance).
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -55,6 +55,8 @@ class GaussianModel(nn.Module):
         >>> GaussianModel(**model.state_dict())
         GaussianModel(20 Gaussians, sh_degree=1 of 3, torch.float32)
     """
+
+    __call__: Callable[..., Gaussians]  # for type checkers, to which torch's says Any
 
     def __init__(
         self,

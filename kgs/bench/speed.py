@@ -139,7 +139,7 @@ class Cases:
         case()
 
     def _gaussians(self) -> Gaussians:
-        return self.model(backend=self.renderer.backend)  # type: ignore[no-any-return]
+        return self.model(backend=self.renderer.backend)
 
     @torch.no_grad()
     def forward(self) -> Any:

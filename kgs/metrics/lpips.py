@@ -10,6 +10,7 @@ where u_l are the features after the last ReLU of block l, scaled to unit length
 
 import math
 import zipfile
+from collections.abc import Callable
 from io import BytesIO
 from os import PathLike
 from pathlib import Path
@@ -40,6 +41,8 @@ class Lpips(nn.Module):
     The state dict has the names of the weight files: torchvision's `features.0.weight`, ... and `lin0` to `lin4`. A
     module made without `load` has random features and heads of ones: a distance, but not LPIPS.
     """
+
+    __call__: Callable[..., Tensor]  # for type checkers, to which torch's says Any
 
     def __init__(self) -> None:
         super().__init__()
