@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kgs._support.torch_threads import torch_on_one_thread
 from kgs.backends import Backend
 
 WINDOW = 7  # pixels, the side of the patches that are compared
@@ -36,7 +37,8 @@ def sweep_costs(
         backend: by numba's kernels, on a CPU, or by torch.
         memory: float32 `(2, H, W, D)`, for the results of kernels, which is faster than new memory for each view.
     """
-    middle = image.mean()  # without it, sums over windows are more exact
+    with torch_on_one_thread():  # else the last bits of a sum depend on the number of threads
+        middle = image.mean()  # without it, sums over windows are more exact
     image = image - middle
     others = others - middle
     if backend.covering("sweep", image).name == "numba":

@@ -121,6 +121,7 @@ def test_a_sweep_stays_on_its_device_and_its_maps_are_on_the_cpu(monkeypatch):
     assert fetched == ["meta"] * 3 * len(views)
 
 
-def test_bits_depend_neither_on_threads_nor_on_repetition():
-    arguments = pictures(2, 70, 61, 24)
+@pytest.mark.parametrize(("height", "width", "planes"), [(70, 61, 24), (300, 400, 2)])  # torch divides larger sums
+def test_bits_depend_neither_on_threads_nor_on_repetition(height, width, planes):
+    arguments = pictures(2, height, width, planes)
     check_bits(lambda: sweep_costs(*arguments, BACKENDS["numba"]), (1, 1, 2, 2, 3, 3, 4, 4))
