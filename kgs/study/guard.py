@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from .grid import finished_rows, read_rows
-from .pairs import grouped, paired_difference
+from .pairs import Difference, grouped, paired_difference
 from .presets import AUTO
-from .texts import counts, document, signed, table_of
+from .texts import counts, document, interval, signed, table_of
 
 TITLE = "Has a change of the code changed the fits?"
 STORED = Path(__file__).with_name("guard.jsonl")
@@ -74,27 +74,6 @@ class Change(NamedTuple):
             return "-"
         noise = "" if math.isnan(self.noise) else f" ({self.noise:.{decimals}f})"
         return signed(self.difference, decimals) + noise + (" !" if self.is_beyond_noise else "")
-
-
-class MeanChange(NamedTuple):
-    """The mean over scenes of a measure's changes, and its 95 % interval over scenes; NaN where there is none."""
-
-    difference: float
-    low: float
-    high: float
-
-    @property
-    def is_beyond_noise(self) -> bool:
-        """Whether 0 is outside of the interval."""
-        return self.low > 0 or self.high < 0  # NaN is not
-
-    def text(self, decimals: int) -> str:
-        """As "-0.12 [-0.18, -0.06] !"."""
-        if math.isnan(self.difference):
-            return "-"
-        low, high = (signed(limit, decimals) for limit in (self.low, self.high))
-        interval = "" if math.isnan(self.low) else f" [{low}, {high}]"
-        return signed(self.difference, decimals) + interval + (" !" if self.is_beyond_noise else "")
 
 
 def write_guard(rows: Sequence[Row], out: Path, command: str, planned: int, stored: Path = STORED) -> str:
@@ -156,7 +135,7 @@ def _tables(new: pd.DataFrame, old: pd.DataFrame, default: pd.DataFrame) -> tupl
     tables = {}
     beyond = list[str]()
     single = list[Change]()
-    of_default = dict[str, MeanChange]()
+    of_default = dict[str, Difference]()
     for (method,), cells in grouped(new, "method"):
         lines = [{"scene": scene} for scene in cells.setting.unique()]
         mean_line = {"scene": f"mean of {len(lines)} scenes"}
@@ -164,15 +143,15 @@ def _tables(new: pd.DataFrame, old: pd.DataFrame, default: pd.DataFrame) -> tupl
             decimals = measure.decimals_of_change
             changes, mean = _changes(cells, old[old.method == method], default, measure)
             values = [*(change.value for change in changes), cells.groupby("setting")[measure.key].mean().mean()]
-            texts = [*(change.text(decimals) for change in changes), mean.text(decimals)]
+            texts = [*(change.text(decimals) for change in changes), _text_of_mean(mean, decimals)]
             for line, value, text in zip([*lines, mean_line], values, texts, strict=True):
                 line[measure.head] = "-" if math.isnan(value) else f"{value:.{measure.decimals}f}"
                 line[measure.head_of_change] = text
             if method == AUTO:
                 of_default[measure.key] = mean
             single += [change for change in changes if not math.isnan(change.noise)]
-            if mean.is_beyond_noise:
-                beyond.append(f"{method}: {measure.head} {mean.text(decimals)}")
+            if _is_beyond_noise(mean):
+                beyond.append(f"{method}: {measure.head} {texts[-1]}")
         tables[method] = table_of([*lines, mean_line] if len(lines) > 1 else lines)
     verdict = f"Beyond noise in the mean: {'; '.join(beyond)}." if beyond else "No mean has changed beyond noise."
     count = sum(change.is_beyond_noise for change in single)
@@ -180,16 +159,30 @@ def _tables(new: pd.DataFrame, old: pd.DataFrame, default: pd.DataFrame) -> tupl
     return tables, [_answer(of_default), verdict, counted]
 
 
-def _answer(means: Mapping[str, MeanChange]) -> str:
+def _is_beyond_noise(mean: Difference) -> bool:
+    """Whether 0 is outside of the interval over scenes."""
+    low, high = mean.over_scenes
+    return low > 0 or high < 0  # NaN is not
+
+
+def _text_of_mean(mean: Difference, decimals: int) -> str:
+    """As "-0.12 [-0.18, -0.06] !", the interval over scenes."""
+    if not mean.pairs:
+        return "-"
+    limits = "" if math.isnan(mean.over_scenes[0]) else f" {interval(mean.over_scenes, decimals)}"
+    return signed(mean.mean, decimals) + limits + (" !" if _is_beyond_noise(mean) else "")
+
+
+def _answer(means: Mapping[str, Difference]) -> str:
     """Whether a change of the default is to be kept, by its mean over scenes: it gains and loses no more than it may.
 
     It gains where PSNR or LPIPS is better by its whole interval.
     """
-    if not means or all(math.isnan(change.low) for change in means.values()):
+    if all(math.isnan(change.over_scenes[0]) for change in means.values()):
         return "There is no verdict: it takes two scenes with stored fits of the default."
-    better = {"psnr": means["psnr"].low > 0, "lpips": means["lpips"].high < 0}
+    better = {"psnr": means["psnr"].over_scenes[0] > 0, "lpips": means["lpips"].over_scenes[1] < 0}
     gains = [key for key, is_better in better.items() if is_better]
-    losses = {key: means[key].difference for key in MAX_LOSS} | {"psnr": -means["psnr"].difference}
+    losses = {key: means[key].mean for key in MAX_LOSS} | {"psnr": -means["psnr"].mean}
     lost = [key for key, loss in losses.items() if loss > MAX_LOSS[key]]
     if gains and not lost:
         return f"Yes: it gains in {' and '.join(gains)}, and loses no more than it may."
@@ -199,7 +192,7 @@ def _answer(means: Mapping[str, MeanChange]) -> str:
 
 def _changes(
     new: pd.DataFrame, old: pd.DataFrame, default: pd.DataFrame, measure: Measure
-) -> tuple[list[Change], MeanChange]:
+) -> tuple[list[Change], Difference]:
     """Of one method: the change of each scene, in order of appearance, and that of their mean."""
     value, before, by_seed = (
         frame.pivot(index="seed", columns="setting", values=measure.key) for frame in (new, old, default)
@@ -210,8 +203,7 @@ def _changes(
     noise = noise.reindex(change.columns) * (2 / change.count()) ** 0.5
     scenes = pd.DataFrame({"value": value.mean(), "difference": change.mean(), "noise": noise})
     changes = [Change(*numbers) for numbers in scenes.loc[new.setting.unique()].itertuples(index=False)]
-    mean = paired_difference(change)
-    return changes, MeanChange(mean.mean, *mean.over_scenes)
+    return changes, paired_difference(change)
 
 
 def _origin(result: Row) -> str:

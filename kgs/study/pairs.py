@@ -11,7 +11,7 @@ from kgs._support.errors import ArgumentError
 from kgs.metrics.evaluate import MEASURES
 
 from .presets import METHODS, SCENES
-from .texts import signed
+from .texts import interval, signed
 
 KEYS = ("scene", "views", "start", "method")  # equal for cells that differ only in the seed
 COLUMNS = [f"{part}.{name}" for part in ("test", "train") for name in MEASURES]
@@ -44,10 +44,9 @@ class Difference(NamedTuple):
             return "-"
         labels = labels or self.scenes > 1
         intervals = []
-        for label, (low, high) in {" over scenes": self.over_scenes, " over seeds": (self.low, self.high)}.items():
-            if not math.isnan(low):
-                interval = f"[{signed(low, decimals)}, {signed(high, decimals)}]"
-                intervals.append(interval + label if labels else interval)
+        for label, limits in {" over scenes": self.over_scenes, " over seeds": (self.low, self.high)}.items():
+            if not math.isnan(limits[0]):
+                intervals.append(interval(limits, decimals) + (label if labels else ""))
         return f"{signed(self.mean, decimals)} {', '.join(intervals)}".rstrip()
 
 

@@ -13,6 +13,12 @@ def signed(value: float, decimals: int) -> str:
     return f"{round(value, decimals) + 0.0:+.{decimals}f}"
 
 
+def interval(limits: tuple[float, float], decimals: int) -> str:
+    """As "[-0.20, +0.82]"."""
+    low, high = (signed(limit, decimals) for limit in limits)
+    return f"[{low}, {high}]"
+
+
 def counts(values: Iterable[str]) -> str:
     """As "200 a; 25 b", the most frequent first."""
     return "; ".join(f"{count} {value}" for value, count in Counter(values).most_common())

@@ -116,6 +116,8 @@ def test_the_mean_has_its_interval_over_scenes(rows_of, report):
     ("noises", "mark", "sentence"),
     [
         (1.9, "", "0 of 4 changes of single scenes are beyond noise"),
+        (2.1, " !", "1 of 4 changes of single scenes are beyond noise"),
+        (-1.9, "", "0 of 4 changes of single scenes are beyond noise"),
         (-2.1, " !", "1 of 4 changes of single scenes are beyond noise"),
     ],
 )
@@ -123,6 +125,21 @@ def test_what_is_beyond_two_noises_is_marked(noises, mark, sentence, rows_of, re
     change = noises * noise(FERN)
     text = report(rows_of(scenes=(FERN,), change=change))
     assert table(text)[FERN]["change of PSNR [dB]"] == f"{change:+.2f} ({noise(FERN):.2f}){mark}"
+    assert sentence in text
+
+
+@pytest.mark.parametrize(
+    ("changes", "mark", "sentence"),
+    [
+        ((0.30, 0.31), " !", "Beyond noise in the mean: auto: PSNR [dB] +"),
+        ((-0.30, -0.31), " !", "Beyond noise in the mean: auto: PSNR [dB] -"),
+        ((-0.30, 0.31), "", "No mean has changed beyond noise"),
+    ],
+)
+def test_a_mean_is_marked_whose_interval_is_beyond_0(changes, mark, sentence, rows_of, report):
+    scenes = zip((FERN, FLOWER), changes, strict=True)
+    text = report([row for scene, change in scenes for row in rows_of((scene,), change=change)])
+    assert table(text)["mean of 2 scenes"]["change of PSNR [dB]"].endswith(f"]{mark}")
     assert sentence in text
 
 
